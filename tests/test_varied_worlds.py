@@ -30,6 +30,7 @@ from manip_il.sim.variation import WORLD_SIZE, with_drawn
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.envs import env_of, make_env
 
+from .pictures import read_episodes
 from .tables import SCENES, every_task
 
 KINDS = ("object", "view", "dynamics")
@@ -119,7 +120,7 @@ def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(
     assert Dataset.open(tmp_path / "varied").episodes.drawn == {
         at: episode.drawn for at, episode in enumerate(episodes)
     }
-    assert [one.drawn for one in Dataset.open(tmp_path / "varied").read_episodes()] == [one.drawn for one in episodes]
+    assert [one.drawn for one in read_episodes(tmp_path / "varied")] == [one.drawn for one in episodes]
     assert examine_folder(tmp_path / "varied") == []
 
 

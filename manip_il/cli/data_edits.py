@@ -8,6 +8,7 @@ from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from manip_il.checks import parse_yaml
 from manip_il.cli.common_options import SMALL, Pictured, Varied
 from manip_il.cli.options import Given, given
 from manip_il.cli.outputs import Replacing, require_writable
@@ -46,16 +47,36 @@ class BuildOptions(Replacing):
         say(f"dataset: {self.dataset}")
 
 
+class RenameMap(dict[str, str]):
+    """Name of a camera's column -> its new name."""
+
+    @classmethod
+    def parse(cls, text: str) -> RenameMap:
+        """Read JSON, as for LeRobot's `--rename_map`. Raises `ValueError` if it is something else."""
+        return cls({str(old): str(new) for old, new in dict(parse_yaml(text)).items()})
+
+
 @dataclass(frozen=True)
 class MergeOptions(Replacing):
-    """Merge several datasets into one, with their episodes in the order given.
+    """Merge datasets into one, with their episodes in the order given; or take some episodes, also of a single dataset.
 
-    Robot, task, rate and cameras must agree. The new dataset's provenance names the sources.
+    Every column, every frame's text and all films are copied. Robot, rate, columns and codecs must agree, and the task
+    if manip-il recorded it. The provenance of datasets of manip-il names the sources.
     """
 
     example: ClassVar[str] = "manip-il data merge datasets/demos datasets/more --output=datasets/both"
     datasets: list[Path] = option(MISSING, "LeRobot v3.0 datasets", exists="datasets/", positional=True)
     output: Path = option(MISSING, "folder of the new dataset")
+    episodes: list[str] = option(
+        list,
+        "episodes to take, numbered through all datasets: 0:50 for the first 50, or [0,3,5]; by default all",
+        flag="dataset.episodes",
+    )
+    renamed: RenameMap = option(
+        RenameMap,
+        'new names of cameras: {"observation.images.top": "observation.images.front"}',
+        flag="rename_map",
+    )
 
     def run(self) -> None:
         """Merge; the new dataset appears when it is complete."""
@@ -64,7 +85,8 @@ class MergeOptions(Replacing):
         with exclusive(self.output):
             require_writable(self.output, DATASET, self.overwrite, self.datasets)
             repo_id = local_id(self.output.absolute().name)
-            info = merge_datasets(self.datasets, self.output, repo_id=repo_id, replace=self.overwrite)
+            part = self.episodes, self.renamed
+            info = merge_datasets(self.datasets, self.output, *part, repo_id=repo_id, replace=self.overwrite)
         say(f"merged {info.episodes:,} episodes, {info.frames:,} frames", f"dataset: {self.output}")
 
 

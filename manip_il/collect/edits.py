@@ -22,11 +22,11 @@ from manip_il.collect.scenes import CHUNK, SceneDrawer, Scenes
 from manip_il.collect.workers import map_in_order
 from manip_il.data import schema
 from manip_il.data.build import dataset_sha256, local_id, rewrite_columns
-from manip_il.data.dataset import UNKNOWN_TASK, Dataset
+from manip_il.data.dataset import UNKNOWN_TASK, Dataset, Own
 from manip_il.data.episodes import to_episode
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.info import Info
-from manip_il.data.lerobot_layout import OURS
+from manip_il.data.lerobot_layout import OURS, Features
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
@@ -99,44 +99,33 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
     """Write `source` with the expert's label of every state; all other columns and pictures stay the same.
 
     States in which the expert was not queried get a label, too. Returns the number of frames whose label changed: its
-    action by more than `NOTICEABLE`, its phase, or its validity. Raises what `Dataset.read_episodes` and
+    action by more than `NOTICEABLE`, its phase, or its validity. Raises what `Dataset.stored_episodes` and
     `rewrite_columns` raise, and `ManipError` if a worker dies.
     """
     source.check_has_no_sag("data relabel")
     scale, dataset = env_actions(source.env).scale, source.dataset
-    changed = 0
-
-    def relabelled() -> Iterator[Columns]:
-        nonlocal changed
-        for episode, columns in labels:
-            changed += _count_changed(episode.columns, columns, scale)
-            target.on_piece()
-            yield columns
-
     simulated = {key: value for key, value in dataset.fingerprint.items() if key.endswith("_sha256")}
     fingerprint = {**env_fingerprint(source.env), **simulated}
-    provenance = {**dataset.provenance, "relabelled": _origin(source)}
-    about: dict[str, Any] = {"repo_id": local_id(target.root.name), "fingerprint": fingerprint}
-    episodes = dataset.read_episodes(pictures=False)
-    with closing(map_in_order(partial(label_episode, source.env), episodes, target.workers)) as labels:
-        rewrite_columns(dataset, target.root, relabelled(), provenance, replace=target.replace, **about)
-    return changed
+    own = Own(dataset.spec, fingerprint, {**dataset.provenance, "relabelled": _origin(source)})
+    _rewrite(source, target, partial(label_states, source.env), own, dataset.stored_features)
+    names = (schema.ACTION, schema.LABEL_VALID, schema.EXPERT_PHASE)
+    return _count_changed(dataset.columns(names), Dataset.open(target.root).columns(names), scale)
 
 
 def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget) -> Info:
     """Write `source` with the pictures of these cameras instead of its own; all other columns stay the same.
 
-    Raises `RenderError` if there is no OpenGL, and what `Dataset.read_episodes` and `write_dataset` raise.
+    Raises `RenderError` if there is no OpenGL, and what `Dataset.stored_episodes` and `rewrite_columns` raise.
     """
     dataset, here = source.dataset, env_spec(source.env, cameras)
     spec = replace(dataset.spec, cameras=here.cameras, image_size=here.image_size, keypoints=here.keypoints)
     look = env_fingerprint(source.env, cameras)["cameras_sha256"]
     rendered = {"from": dataset.root.name, "cameras": asdict(cameras)}
-    provenance = {**dataset.provenance, "rendered": rendered}
-    fingerprint = {**dataset.fingerprint, "cameras_sha256": look}
-    work = partial(_render_episode, source.env, cameras)
-    episodes = (one.without_pictures() for one in dataset.read_episodes(pictures=False))
-    return _write(target, spec, fingerprint, provenance, work, episodes)
+    own = Own(spec, {**dataset.fingerprint, "cameras_sha256": look}, {**dataset.provenance, "rendered": rendered})
+    ours = schema.features(dataset.spec)
+    others = {key: one for key, one in dataset.stored_features.items() if key not in ours}
+    work = partial(render_states, source.env, cameras)
+    return _rewrite(source, target, work, own, schema.features(spec) | others)
 
 
 def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> Info:
@@ -164,6 +153,22 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
     return _write(target, spec, fingerprint, provenance, work, pieces)
 
 
+def _rewrite(
+    source: EditSource, target: EditTarget, work: Callable[[NDArray[Any]], Columns], own: Own, features: Features
+) -> Info:
+    """Write `source` with the columns that workers make from each episode's states, (T, m). features: of the target."""
+
+    def columns() -> Iterator[Columns]:
+        for _, found in made:
+            target.on_piece()
+            yield found
+
+    episodes = source.dataset.stored_episodes([schema.SIM_STATE])
+    states = (np.asarray(one.columns[schema.SIM_STATE]) for one in episodes)
+    with closing(map_in_order(work, states, target.workers)) as made:
+        return rewrite_columns(source.dataset, target.root, columns(), own, features, replace=target.replace)
+
+
 def _write[T](
     target: EditTarget,
     spec: RobotTaskSpec,
@@ -188,13 +193,13 @@ def _write[T](
         return write_dataset(episodes(), target.root, spec, provenance, replace=target.replace, **about)
 
 
-def label_episode(env: EnvConfig, episode: Episode) -> Columns:
-    """Return the expert's labels of an episode's states as columns of a dataset, (T,) or (T, n).
+def label_states(env: EnvConfig, states: NDArray[Any]) -> Columns:
+    """Return the expert's labels of states, rows of `sim_state` (T, m), as columns of a dataset, (T,) or (T, n).
 
     If a label is invalid, its action holds the arm still and `label_valid` is 0.
     """
     expert = make_expert(env)
-    labels = [expert.label(State.from_vector(state)) for state in episode.columns[schema.SIM_STATE]]
+    labels = [expert.label(State.from_vector(state)) for state in states]
     return {
         schema.ACTION: np.stack([label.action for label in labels]).astype(np.float32),
         schema.LABEL_VALID: np.array([label.valid for label in labels], np.int64),
@@ -226,11 +231,6 @@ def _count_changed(before: Columns, after: Columns, scale: NDArray[np.float64]) 
     gaps = (np.abs(before[schema.ACTION] - after[schema.ACTION]) / scale).max(axis=1)
     same = (before[key].ravel() == after[key].ravel() for key in (schema.LABEL_VALID, schema.EXPERT_PHASE))
     return int((~np.logical_and(*same) | (gaps > NOTICEABLE)).sum())
-
-
-def _render_episode(env: EnvConfig, cameras: CameraConfig, episode: Episode) -> list[Episode]:
-    pictures = render_states(env, cameras, episode.columns[schema.SIM_STATE])
-    return [replace(episode, columns={**episode.columns, **pictures})]
 
 
 def _leads(source: EditSource, columns: Columns) -> NDArray[np.float64]:

@@ -17,19 +17,21 @@ import numpy as np
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import write_json
-from manip_il.data.dataset import UNKNOWN_TASK, Dataset
+from manip_il.data.dataset import UNKNOWN_TASK, Dataset, Own
 from manip_il.data.episodes import parts
 from manip_il.data.fingerprint import compare_fingerprints, file_sha256
-from manip_il.data.info import Info, reading
+from manip_il.data.info import PICTURES, Info, read_info, reading
 from manip_il.data.journal import Journal, list_episodes, read_journal
-from manip_il.data.lerobot_write import Columns, Films, write_dataset
-from manip_il.data.schema import LABEL_VALID, check_same_spec
+from manip_il.data.lerobot_write import Columns, new_dataset, write_dataset
+from manip_il.data.schema import IMAGES, LABEL_VALID, check_same_spec
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import ManipError, MismatchError, NothingToLearnError
-from manip_il.mdp import Episode
+from manip_il.errors import ManipError, MismatchError, NothingToLearnError, UnknownName, UsageError
+from manip_il.mdp import KEYPOINTS, Episode
 
 _LOG = logging.getLogger(__name__)
 RECORDING = "recording.json"
+# settings of an encoder, which may differ between films of a camera
+_ENCODER = [f"video.{one}" for one in ("g", "crf", "preset", "fast_decode", "video_backend", "extra_options")]
 Rollouts = Iterable[tuple[Journal, Episode]]
 
 
@@ -148,54 +150,154 @@ def build(journals: Path, root: Path, *, replace: bool = False) -> tuple[Info, i
 def merge_datasets(
     roots: Sequence[Path],
     root: Path,
+    episodes: Sequence[str] = (),
+    renamed: Mapping[str, str] | None = None,
     *,
     repo_id: str,
     provenance: Mapping[str, Any] | None = None,
     replace: bool = False,
 ) -> Info:
-    """Merge several datasets, in order, into one; equal to `write_dataset` of all their episodes.
+    """Merge datasets, ours or others', in order, into one; equal to `write_dataset` of all their episodes if ours.
 
-    The fingerprint is the first dataset's; if another differs, a warning is logged. The names and provenance of the
-    sources are added to `provenance`. Video files are copied. Raises `MismatchError` naming both sides if the specs
-    differ.
+    Every column, every frame's text and the video files are copied. Datasets of ours are described as such: the
+    fingerprint is the first one's, and if another differs, a warning is logged; the names and provenance of the sources
+    are added to `provenance`.
+
+    Args:
+        roots: The datasets.
+        root: The new one.
+        repo_id: Its id, if a dataset is ours.
+        provenance: Its origin, if a dataset is ours.
+        replace: As in `new_folder`.
+        episodes: Episodes to keep, as in `choose_episodes`, numbered as in the merged datasets; by default all.
+        renamed: Camera -> its new name, both with `observation.images.`.
+
+    Raises:
+        MismatchError: Robot, rate, columns or codecs differ; names both sides.
+        UsageError: An episode does not exist, or a name is invalid.
+        UnknownName: There is no such camera.
     """
     opened = [Dataset.open(source) for source in roots]
-    about = next((one for one in opened if one.spec.task != UNKNOWN_TASK), opened[0])
-    own = opened[0].fingerprint
+    kept = choose_episodes(episodes, sum(one.info.episodes for one in opened))
+    names = _new_names(opened, renamed or {})
+    own = _merged_description(opened, names, provenance or {})
+    features: layout.Features = {}
     for one in opened:
-        also = ("sim_state_size", "cameras", "image_size", *(("task",) if one.spec.task != UNKNOWN_TASK else ()))
-        check_same_spec(str(about.root), about.spec, str(one.root), one.spec, also)
-        for warning in compare_fingerprints(str(roots[0]), own, str(one.root), one.fingerprint):
-            _LOG.warning("%s", warning)
-    sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
-    options: dict[str, Any] = {"repo_id": repo_id, "fingerprint": own, "replace": replace}
-    episodes = itertools.chain.from_iterable(map(_with_films, opened))
-    spec = dataclasses.replace(about.spec, video=any(one.spec.video for one in opened))
-    return write_dataset(episodes, root, spec, {**(provenance or {}), "merged": sources}, **options)
+        _check_same_facts(opened[0], one, names)
+        table = {names.get(key, key): feature for key, feature in one.stored_features.items()}
+        if len(table) < len(one.stored_features):
+            raise UsageError(f"--rename_map gives two columns of {one.root} the same name")
+        for key, feature in table.items():
+            if features.setdefault(key, feature)["dtype"] == "image":  # encoded if others have films
+                features[key] = feature
+    about = opened[0].fps, opened[0].info.robot or None, own, repo_id
+    before, tables = 0, opened[0].other_tables
+    with new_dataset(root, features, *about, tables=tables, replace=replace) as writer:
+        for dataset in opened:
+            chosen = {*range(before, before + dataset.info.episodes)} & kept
+            for one in dataset.stored_episodes(renamed=names):
+                if before + one.number in chosen:
+                    cut = len(chosen) < dataset.info.episodes
+                    writer.add_columns(one.columns, one.tasks, one.others, one, cut=cut)
+            before += dataset.info.episodes
+    return read_info(root)
+
+
+def choose_episodes(words: Sequence[str], count: int) -> set[int]:
+    """Return the numbers of the chosen episodes among `count`. words: `7`, `0:50` (0 to 49), `50:`; none: all."""
+    chosen: set[int] = set()
+    for word in words or [":"]:
+        first, colon, stop = word.partition(":")
+        try:
+            numbers = range(int(first or 0), int(stop or count) if colon else int(first) + 1)
+        except ValueError:
+            numbers = range(0)
+        if not 0 <= numbers.start < numbers.stop <= count:
+            raise UsageError(f"--dataset.episodes has {checks.shorten(word)}; expected numbers and ranges in 0:{count}")
+        chosen.update(numbers)
+    return chosen
 
 
 def rewrite_columns(
-    dataset: Dataset, target: Path, columns: Iterable[Columns], provenance: Mapping[str, Any], **options: Any
+    dataset: Dataset,
+    target: Path,
+    columns: Iterable[Columns],
+    own: Own,
+    features: layout.Features,
+    *,
+    replace: bool = False,
 ) -> Info:
-    """Write a dataset to `target` with some columns replaced; video files are copied.
+    """Write a dataset to `target` with some columns replaced; all other columns, texts and films stay the same.
 
-    columns: for every episode in stored order, name -> (T,) or (T, d). options: those of `write_dataset`. Raises what
-    `write_dataset` raises, and `ManipError` if a column and its episode differ in length.
+    Args:
+        dataset: The source.
+        target: The new folder.
+        columns: For every episode in stored order, name -> (T,) or (T, d), or pictures (T, height, width, 3).
+        own: The new dataset's description.
+        features: Its columns; those that `columns` lack are the source's.
+        replace: As in `new_folder`.
     """
-
-    def changed() -> Iterator[tuple[Episode, Films | None]]:
-        for (episode, films), fresh in zip(_with_films(dataset), columns, strict=True):
-            own = episode.columns | {key: values.reshape(len(values), -1) for key, values in fresh.items()}
-            yield dataclasses.replace(episode, columns=own), films
-
-    return write_dataset(changed(), target, dataset.spec, provenance, **options)
+    about = dataset.fps, dataset.info.robot or None, own, local_id(target.name)
+    with new_dataset(target, features, *about, tables=dataset.other_tables, replace=replace) as writer:
+        for one, fresh in zip(dataset.stored_episodes(), columns, strict=True):
+            writer.add_columns({**one.columns, **fresh}, one.tasks, one.others, one)
+    return read_info(target)
 
 
-def _with_films(dataset: Dataset) -> Iterator[tuple[Episode, Films | None]]:
-    """Yield the episodes of a dataset; pictures in video files are not decoded but passed on as `Films`."""
-    films = bool(dataset.spec.cameras and dataset.spec.video)
-    for number, episode in enumerate(dataset.read_episodes(pictures=not films)):
-        yield episode, (dataset, number) if films else None
+def _merged_description(
+    opened: Sequence[Dataset], names: Mapping[str, str], provenance: Mapping[str, Any]
+) -> Own | None:
+    """Return the content of `meta/manip_il.json` for merged datasets; None if no dataset is ours."""
+    if not any(one.own for one in opened):
+        return None
+    about = next((one for one in opened if one.spec.task != UNKNOWN_TASK), opened[0])
+    own = opened[0].fingerprint
+    for one in opened:
+        also = ("sim_state_size", "image_size", *(("task",) if one.spec.task != UNKNOWN_TASK else ()))
+        check_same_spec(str(about.root), about.spec, str(one.root), one.spec, also)
+        for warning in compare_fingerprints(str(opened[0].root), own, str(one.root), one.fingerprint):
+            _LOG.warning("%s", warning)
+    sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
+    cameras = tuple(names.get(key, key).removeprefix(IMAGES) for key in about.spec.image_keys)
+    spec = dataclasses.replace(about.spec, cameras=cameras, video=any(one.spec.video for one in opened))
+    return Own(spec, own, {**provenance, "merged": sources})
+
+
+def _new_names(opened: Sequence[Dataset], renamed: Mapping[str, str]) -> dict[str, str]:
+    """Return the new names of the columns of the cameras in `renamed`: pictures and keypoints."""
+    known, names = {key for one in opened for key in one.cameras}, dict[str, str]()
+    for old, new in renamed.items():
+        if old not in known:
+            raise UnknownName("camera in --rename_map", old, known)
+        if any(one.info.of_dtype("language") for one in opened):
+            raise UsageError("--rename_map cannot rename the cameras that columns of language name")
+        camera = checks.name("a camera in --rename_map", new.removeprefix(IMAGES))
+        names |= {old: IMAGES + camera, KEYPOINTS + old.removeprefix(IMAGES): KEYPOINTS + camera}
+    return names
+
+
+def _check_same_facts(left: Dataset, right: Dataset, names: Mapping[str, str]) -> None:
+    """Raise `MismatchError` unless two datasets can be merged. names: new names of columns."""
+    ours, theirs = _facts(left, names), _facts(right, names)
+    for what in {**ours, **theirs}:
+        one, other = ours.get(what, "none"), theirs.get(what, "none")
+        is_unknown = what.startswith("film ") and "none" in (one, other)  # no film, or not described as fully
+        if one != other and not is_unknown:
+            raise MismatchError(what, str(left.root), one, str(right.root), other)
+
+
+def _facts(dataset: Dataset, names: Mapping[str, str]) -> dict[str, str]:
+    """Return what merged datasets must have in common: rate, robot, columns, films, other tables."""
+    facts = {"fps": str(dataset.fps), "robot_type": dataset.info.robot or "none"}
+    for key, one in dataset.features.items():
+        name, kind = names.get(key, key), "pictures" if one.dtype in PICTURES else one.dtype
+        facts[f"column {name}"] = f"{kind} of shape {[*one.shape]}, named {one.names}"
+        facts |= {f"film {name}: {what}": str(value) for what, value in one.details.items() if what not in _ENCODER}
+    for key in {key for row in dataset.episodes.others for key in row} - {layout.DRAWN}:
+        facts[f"column {key} of meta/episodes"] = "a column"
+    for path in dataset.other_tables:
+        facts[f"meta/{path.name}"] = f"sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+    return facts
 
 
 def dataset_sha256(root: Path) -> str:

@@ -21,6 +21,7 @@ from manip_il.data import schema as s
 from manip_il.data.camera import Camera
 from manip_il.data.info import NUMBERS, PICTURES, Feature, Info, read_info, reading
 from manip_il.data.parquet_files import (
+    Column,
     EpisodeTable,
     count_rows,
     read_episode_table,
@@ -31,9 +32,9 @@ from manip_il.data.parquet_files import (
 )
 from manip_il.data.statistics import Statistics, column_statistics, read_statistics
 from manip_il.errors import ManipError, UnknownName, UsageError
-from manip_il.mdp import Episode
 
 UNKNOWN_TASK = UNKNOWN_ROBOT = "unknown"
+_NUMBERED = (layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,24 @@ class Own:
     spec: s.RobotTaskSpec
     fingerprint: Mapping[str, Any]
     provenance: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class StoredEpisode:
+    """An episode as it is stored.
+
+    tasks: the text of every frame. others: values in the columns of `meta/episodes` that LeRobot does not have.
+    columns: those of the data files, (T,) or (T, ...); all but numbers as Arrow arrays. clips: by camera, as from
+    `Dataset.clip`.
+    """
+
+    dataset: Dataset
+    number: int
+    tasks: list[str]
+    others: dict[str, Any]
+    columns: dict[str, Column]
+    clips: dict[str, tuple[Path, int, int]]
+    picture_statistics: Statistics
 
 
 class Dataset:
@@ -218,30 +237,55 @@ class Dataset:
         [place] = np.flatnonzero(table.index == episode)[:1]
         return np.arange(table.start[place], table.start[place] + table.length[place])
 
-    def read_episodes(self, *, pictures: bool = True) -> Iterator[Episode]:
-        """Yield the episodes of a dataset with our columns, in order, scalars as (T, 1) columns.
+    @cached_property
+    def stored_features(self) -> layout.Features:
+        """The features in `info.json`, with everything that it says of them, without LeRobot's index columns."""
+        table = checks.read_json(self.root / layout.INFO, "a dataset's description")["features"]
+        return {key: one for key, one in table.items() if key not in layout.INDEX_DTYPES}
 
-        pictures: include them. Success is read from `next.success`. One data file is in memory at a time.
+    @property
+    def other_tables(self) -> list[Path]:
+        """The tables in `meta/` that are not LeRobot's, such as texts of subtasks."""
+        return [path for path in self.root.glob("meta/*.parquet") if path != self.root / layout.TASKS]
+
+    def texts(self, numbers: NDArray[np.int64]) -> list[str]:
+        """Return the task text of each `task_index`, (T,). Raises `ManipError` for an index without a text."""
+        if missing := set(numbers.tolist()) - self.tasks.keys():
+            raise ManipError(f"{self.root}: rows have task {min(missing)}, which {layout.TASKS} lacks")
+        return [self.tasks[number] for number in numbers.tolist()]
+
+    def stored_episodes(
+        self, names: Sequence[str] | None = None, renamed: Mapping[str, str] | None = None
+    ) -> Iterator[StoredEpisode]:
+        """Yield the episodes as they are stored, in order; one data file is in memory at a time.
+
+        names: columns to read, by default all in data files, except the numbers of rows, episodes and tasks. renamed:
+        new names of columns and cameras.
         """
-        cameras = {key: self.camera(key) for key in self.spec.image_keys} if pictures else {}
-        left_out = {} if pictures else self.spec.image_keys
-        shapes = {key: one["shape"] for key, one in s.features(self.spec).items() if key not in left_out}
-        stored = [key for key in shapes if key not in cameras]
-        texts, drawn, row = self.tasks, self.episodes.drawn, 0
-        for piece in self.pieces([*stored, layout.EPISODE_INDEX, layout.TASK_INDEX]):
-            index, task = (piece[name].reshape(-1) for name in (layout.EPISODE_INDEX, layout.TASK_INDEX))
-            starts = np.flatnonzero(np.diff(index, prepend=-1))
-            for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
-                own: dict[str, NDArray[Any]] = {
-                    key: camera.rows(np.arange(row + start, row + stop)) for key, camera in cameras.items()
-                }
-                own |= {key: piece[key][start:stop].reshape(-1, *shapes[key]) for key in stored}
-                if (text := texts.get(int(task[start]))) is None:
-                    raise ManipError(f"{self.root}: rows have task {task[start]}, which {layout.TASKS} lacks")
-                columns, solved = {key: own[key] for key in shapes}, own[s.SUCCESS]
-                ends = bool(solved.any()), bool(solved[-1])
-                yield Episode(int(own[s.SEED].flat[0]), columns, *ends, text, drawn.get(int(index[start]), {}))
-            row += len(index)
+        if names is None:
+            names = [key for key, one in self.features.items() if one.dtype != "video" and key not in _NUMBERED]
+        new = {key: (renamed or {}).get(key, key) for key in self.features}
+        undrawn = {layout.DRAWN: "{}"} if s.SIM_STATE in self.features else {}
+        for path in self.data_files:
+            with reading(path):
+                rows = read_file(path, [*names, layout.EPISODE_INDEX, layout.TASK_INDEX])
+                index, columns = rows.column(layout.EPISODE_INDEX).to_numpy(), dict[str, Column]()
+                for name in names:
+                    column, feature = rows.column(name), self.features[name]
+                    columns[new[name]] = to_numpy(column, feature) if feature.dtype in NUMBERS else column
+                texts = self.texts(rows.column(layout.TASK_INDEX).to_numpy())
+                for number in np.unique(index).tolist():
+                    start, stop = np.searchsorted(index, [number, number + 1])
+                    [place] = np.flatnonzero(self.episodes.index == number)
+                    yield StoredEpisode(
+                        dataset=self,
+                        number=number,
+                        tasks=texts[start:stop],
+                        others=undrawn | self.episodes.others[place],
+                        columns={name: column[start:stop] for name, column in columns.items()},
+                        clips={new[key]: self.clip(key, number) for key in self.episodes.clips},
+                        picture_statistics={new[key]: one for key, one in self.picture_statistics[place].items()},
+                    )
 
     def count_successes(self) -> int:
         """Return how many episodes succeeded at some step; 0 if there is no success column."""

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import PICTURES
-from manip_il.data.lerobot_layout import TASKS, Features
+from manip_il.data.lerobot_layout import Features
 from manip_il.data.statistics import Statistics, pool
-from manip_il.errors import ManipError
 
 I64 = NDArray[np.int64]
 _IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}  # from LeRobot, for every camera
@@ -50,9 +49,7 @@ class JoinedDatasets:
         pieces = np.split(own, np.cumsum([*map(len, self.datasets)])[:-1])
         for dataset, piece in zip(self.datasets, pieces, strict=True):
             numbers, which = np.unique(piece, return_inverse=True)
-            if missing := set(numbers.tolist()) - dataset.tasks.keys():
-                raise ManipError(f"{dataset.root}: rows have task {min(missing)}, which {TASKS} lacks")
-            found.append(np.array([places[dataset.tasks[one]] for one in numbers.tolist()], np.int64)[which])
+            found.append(np.array([places[text] for text in dataset.texts(numbers)], np.int64)[which])
         return np.concatenate(found)
 
     def _statistics(self) -> Statistics:

@@ -6,7 +6,7 @@ Copied here (and tests compare the two), because importing `lerobot.datasets` im
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +40,11 @@ PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})  # a file's con
 STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
-def data_schema(features: Features) -> pa.Schema:
+def data_schema(features: Features, columns: Mapping[str, Any]) -> pa.Schema:
     """Return the Arrow schema of the data files: shape (1,) becomes a plain value, a vector a list of fixed size.
 
-    Its metadata describes the columns in the form that Hugging Face's package `datasets` reads.
+    Its metadata describes the columns in the form that Hugging Face's package `datasets` reads. columns: those of an
+    episode; types that are not LeRobot's for numbers, text or pictures, such as language, are kept.
     """
     fields: list[pa.Field] = []
     hugging_face: dict[str, Any] = {}
@@ -53,6 +54,9 @@ def data_schema(features: Features) -> pa.Schema:
         if feature["dtype"] == "image":
             fields.append(pa.field(key, PICTURE))
             hugging_face[key] = {"_type": "Image"}
+            continue
+        if isinstance(columns[key], pa.ChunkedArray) and feature["dtype"] != "string":
+            fields.append(pa.field(key, columns[key].type))
             continue
         value: dict[str, Any] = {"dtype": feature["dtype"], "_type": "Value"}
         dtype, shape = pa.type_for_alias(feature["dtype"]), feature["shape"]

@@ -7,8 +7,9 @@ files in a few milliseconds per episode, and the dataset appears complete or not
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import closing, suppress
+import shutil
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,10 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder
-from manip_il.data.dataset import Dataset
+from manip_il.data.camera import decode_picture
+from manip_il.data.dataset import Own, StoredEpisode
 from manip_il.data.info import PICTURES, Info, read_info
-from manip_il.data.ownership import DATASET
-from manip_il.data.parquet_files import ParquetFiles, to_table
+from manip_il.data.parquet_files import Column, ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, features, ordered_columns
 from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, pool, to_lists
 from manip_il.data.video import CameraFiles
@@ -35,11 +36,10 @@ _GROUP_ROWS = 1_000  # frames per row group
 _GROUP_EPISODES = 100  # episodes per row group of meta/episodes
 _FORMAT = 1  # version of meta/manip_il.json
 Columns = Mapping[str, NDArray[Any]]
-Films = tuple[Dataset, int]  # a dataset whose video files have the pictures, and the index of the episode in it
 
 
 def write_dataset(
-    episodes: Iterable[Episode | tuple[Episode, Films | None]],
+    episodes: Iterable[Episode],
     root: Path,
     spec: RobotTaskSpec,
     provenance: Mapping[str, Any] | None = None,
@@ -52,23 +52,57 @@ def write_dataset(
     """Write the episodes, in order, as a dataset with our columns; return its `info.json`.
 
     The dataset appears when it is complete. Episodes are taken one by one and not kept; the same ones in the same order
-    give the same bytes, videos included. An episode with `Films` has no pictures: the video files are copied.
-    provenance: origin of the episodes, read after the last episode. replace: replace a dataset; otherwise, if `root`
-    is not empty, raises `FolderExistsError` before taking an episode. Also raises what `ordered_columns` raises, and
-    `ManipError` if there are no episodes or the disk is full.
+    give the same bytes, videos included. provenance: origin of the episodes, read after the last episode. replace: replace
+    in `new_folder`; otherwise, if `root` is not empty, raises `FolderExistsError` before taking an episode. Also raises
+    what `ordered_columns` raises, and `ManipError` if there are no episodes or the disk is full.
     """
-    about = features(spec), spec.fps, spec.robot_type or spec.robot, video
+    about = Own(spec, fingerprint, {} if provenance is None else provenance), repo_id
+    robot = spec.robot_type or spec.robot
+    with new_dataset(root, features(spec), spec.fps, robot, *about, video=video, replace=replace) as writer:
+        for episode in episodes:
+            text = checks.text("instruction", episode.instruction or spec.instruction)
+            drawn = {layout.DRAWN: json.dumps(dict(episode.drawn))}
+            writer.add_columns(ordered_columns(episode, spec), [text] * len(episode), drawn)
+    return read_info(root)
+
+
+@contextmanager
+def new_dataset(
+    root: Path,
+    features: layout.Features,
+    fps: float,
+    robot_type: str | None,
+    own: Own | None = None,
+    repo_id: str = "",
+    *,
+    video: VideoConfig = VideoConfig(),  # noqa: B008  # frozen
+    tables: Iterable[Path] = (),
+    replace: bool = False,
+) -> Generator[TableWriter]:
+    """Yield the writer of a dataset, which appears when it is complete.
+
+    Args:
+        root: The new folder.
+        features: As in `TableWriter`.
+        fps: Frame rate [Hz].
+        robot_type: LeRobot's name of the robot.
+        own: Content of `meta/manip_il.json`, if it is a dataset of ours; read at the end.
+        repo_id: Its id, stored there.
+        video: Settings of the encoder.
+        tables: Other files of `meta/`, to be copied.
+        replace: Replace a dataset of ours.
+    """
+    about = features, fps, robot_type, video
     replaces = DATASET if replace else ""
     with new_folder(root, replaces=replaces) as folder, closing(TableWriter(folder, *about)) as writer:
-        for item in episodes:
-            episode, films = (item, None) if isinstance(item, Episode) else item
-            columns = ordered_columns(episode, spec, writer.films if films else ())
-            text = checks.text("instruction", episode.instruction or spec.instruction)
-            writer.add_columns(columns, [text] * len(episode), json.dumps(dict(episode.drawn)), films)
+        yield writer
         writer.close_files()
-        ours = {"format": _FORMAT, "repo_id": repo_id, "spec": spec.to_json(), "fingerprint": dict(fingerprint)}
-        layout.write_json(folder / layout.OURS, {**ours, "provenance": dict(provenance or {})})
-    return read_info(root)
+        for path in tables:
+            shutil.copyfile(path, folder / "meta" / path.name)
+        if own is not None:
+            ours = {"format": _FORMAT, "repo_id": repo_id, "spec": own.spec.to_json()}
+            ours |= {"fingerprint": dict(own.fingerprint), "provenance": dict(own.provenance)}
+            layout.write_json(folder / layout.OURS, ours)
 
 
 class TableWriter:
@@ -88,9 +122,10 @@ class TableWriter:
         index: layout.Features = {
             key: {"dtype": kind, "shape": (1,), "names": None} for key, kind in layout.INDEX_DTYPES.items()
         }
-        self.features, self.folder = {**features, **index}, folder
-        self._fps, self._robot_type = fps, robot_type
-        self._schema = layout.data_schema(self.features)
+        self.features = {key: {**one, "shape": tuple(one["shape"])} for key, one in {**features, **index}.items()}
+        self._folder = folder
+        self._fps, self._robot_type = fps if fps % 1 else int(fps), robot_type
+        self._schema: pa.Schema | None = None  # known with the first episode
         self._data = ParquetFiles(folder, layout.DATA_PATH, _GROUP_ROWS)
         self._meta = ParquetFiles(folder, layout.EPISODES_PATH)
         self._rows: list[dict[str, Any]] = []
@@ -102,20 +137,41 @@ class TableWriter:
         self.episodes = self.frames = 0
 
     def add_columns(
-        self, columns: Columns, tasks: Sequence[str], drawn: str | None = None, films: Films | None = None
+        self,
+        columns: Mapping[str, Column],
+        tasks: Sequence[str],
+        others: Mapping[str, Any],
+        stored: StoredEpisode | None = None,
+        *,
+        cut: bool = False,
     ) -> None:
-        """Append an episode. columns: (T,) or (T, ...), pictures (T, height, width, 3). tasks: text of every frame.
+        """Append an episode. Raises what writing raises.
 
-        drawn: random draws, as JSON. films: videos to copy if `columns` has no pictures. Raises what writing raises.
+        Args:
+            columns: (T,) or (T, ...), pictures (T, height, width, 3).
+            tasks: Text of every frame.
+            others: Columns of `meta/episodes` that LeRobot does not have, and their values.
+            stored: Has the films that are not in `columns`, and the statistics of pictures that are not decoded there.
+            cut: Copy only the episode's part of a film.
         """
         numbers = np.array([self._tasks.setdefault(text, len(self._tasks)) for text in tasks], np.int64)
-        columns = {**columns, **self._index_columns(numbers)}
-        statistics = dict(films[0].picture_statistics[films[1]]) if films else {}
-        for key, feature in self.features.items():
-            if feature["dtype"] in PICTURES and not films:
-                statistics[key] = picture_statistics(columns[key])
-        plain = {key: one for key, one in columns.items() if key not in statistics and one.dtype.kind not in "OU"}
+        given = {**self._index_columns(numbers), **columns}
+        columns = {key: given[key] for key in self.features if key in given}
+        statistics = dict(stored.picture_statistics) if stored else {}
+        plain: dict[str, NDArray[Any]] = {}
+        for key, values in columns.items():
+            if key in self.films and isinstance(values, pa.ChunkedArray):  # pictures of the data files
+                columns[key] = values = np.stack([decode_picture(cell["bytes"]) for cell in values.to_pylist()])
+            if not isinstance(values, np.ndarray):
+                continue
+            if self.features[key]["dtype"] in PICTURES:
+                statistics[key] = picture_statistics(values)
+            elif self.features[key]["shape"] == (1,):
+                columns[key] = values = values.reshape(-1)
+            if key not in statistics and values.dtype.kind not in "OU":
+                plain[key] = values
         statistics |= column_statistics(plain)
+        self._schema = self._schema or layout.data_schema(self.features, columns)
         chunk, file = self._data.write(to_table(columns, self._schema))
         row: dict[str, Any] = {
             layout.EPISODE_INDEX: self.episodes,
@@ -125,10 +181,11 @@ class TableWriter:
             "data/file_index": file,
             "dataset_from_index": self.frames,
             "dataset_to_index": self.frames + len(tasks),
-            **({} if drawn is None else {layout.DRAWN: drawn}),
+            **others,
         }
         for key, film in self.films.items():
-            clip = film.copy(*films) if films else film.write(columns[key])
+            copied = stored if key not in columns else None
+            clip = film.copy(copied, cut=cut) if copied else film.write(columns[key])
             row |= {
                 f"videos/{key}/chunk_index": clip.chunk,
                 f"videos/{key}/file_index": clip.file,
@@ -156,7 +213,8 @@ class TableWriter:
             files.close()
         table = {key: {**feature, "shape": list(feature["shape"])} for key, feature in self.features.items()}
         for key, film in self.films.items():
-            table[key]["info"] = film.info()
+            if film.encodes:
+                table[key].setdefault("info", film.info())
         about = {  # in LeRobot's order
             "codebase_version": layout.VERSION,
             "fps": self._fps,
@@ -172,10 +230,10 @@ class TableWriter:
             "robot_type": self._robot_type,
             "splits": {"train": f"0:{self.episodes}"},
         }
-        layout.write_json(self.folder / layout.INFO, about)
+        layout.write_json(self._folder / layout.INFO, about)
         tasks = layout.tasks_table(list(self._tasks))
-        pq.write_table(tasks, self.folder / layout.TASKS, write_page_checksum=True)
-        layout.write_json(self.folder / layout.STATS, to_lists(self._pooled))
+        pq.write_table(tasks, self._folder / layout.TASKS, write_page_checksum=True)
+        layout.write_json(self._folder / layout.STATS, to_lists(self._pooled))
 
     def close(self) -> None:
         """Close all files, complete or not."""

@@ -7,6 +7,7 @@ keeps the column, its split and delete drop it; the draws are also part of `sim_
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -27,6 +28,10 @@ from manip_il.data.statistics import Statistics
 from manip_il.errors import ManipError
 
 I64, F64 = NDArray[np.int64], NDArray[np.float64]
+Column = Any  # numpy array, (T,) or (T, ...); of datasets, all but numbers are Arrow arrays
+
+# LeRobot's columns of `meta/episodes`
+_EPISODE_COLUMNS = re.compile(r"episode_index|tasks|length|dataset_(from|to)_index|(data|meta|stats|videos)/.*")
 
 
 class ParquetFiles:
@@ -86,12 +91,14 @@ class ParquetFiles:
         self._writer.write_table(table)
 
 
-def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table:
+def to_table(columns: Mapping[str, Column], schema: pa.Schema) -> pa.Table:
     """Return columns (T,) and (T, ...) as an Arrow table: vectors as lists, pictures as PNG."""
-    arrays: list[pa.Array] = []
+    arrays: list[pa.Array | pa.ChunkedArray] = []
     for column in schema:
         values = columns[column.name]
-        if column.type == layout.PICTURE:
+        if isinstance(values, pa.ChunkedArray):
+            arrays.append(values.cast(column.type))
+        elif column.type == layout.PICTURE:
             arrays.append(pa.array([{"bytes": _to_png(picture), "path": None} for picture in values], column.type))
         elif values.ndim > 2:
             arrays.append(pa.array(values.tolist(), column.type))
@@ -178,7 +185,10 @@ class VideoSpans:
 
 @dataclass(frozen=True)
 class EpisodeTable:
-    """Columns with one entry per episode. start, stop: rows, stop excluded. drawn: random draws by episode index."""
+    """Columns with one entry per episode. start, stop: rows, stop excluded. drawn: random draws by episode index.
+
+    others: values in the columns that LeRobot does not have.
+    """
 
     index: I64
     length: I64
@@ -187,6 +197,7 @@ class EpisodeTable:
     tasks: list[list[str]]
     clips: dict[str, VideoSpans]  # by camera column
     drawn: dict[int, dict[str, Any]] = field(default_factory=dict[int, dict[str, Any]])
+    others: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
 
     def __len__(self) -> int:
         return len(self.index)
@@ -231,6 +242,7 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
                 for number, text in zip(index.tolist(), drawn, strict=True)
                 if text
             },
+            others=table.select([one for one in table.column_names if not _EPISODE_COLUMNS.fullmatch(one)]).to_pylist(),
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from itertools import zip_longest
@@ -168,14 +168,13 @@ def check_same_spec(left_name: str, left: Any, right_name: str, right: RobotTask
             raise MismatchError(what, left_name, ours or none, right_name, theirs or none)
 
 
-def ordered_columns(episode: Episode, spec: RobotTaskSpec, without: Collection[str] = ()) -> dict[str, NDArray[Any]]:
-    """Return the episode's columns in the order of `features(spec)`, except those in `without`.
+def ordered_columns(episode: Episode, spec: RobotTaskSpec) -> dict[str, NDArray[Any]]:
+    """Return the episode's columns in the order of `features(spec)`.
 
-    (T,) for scalars, (T, d) for vectors, uint8 (T, height, width, 3) for pictures. Raises `MismatchError` if the
-    episode has other columns.
+    (T, d) for numbers, uint8 (T, height, width, 3) for pictures. Raises `MismatchError` if the episode has other
+    columns.
     """
-    table = {key: feature for key, feature in features(spec).items() if key not in without}
+    table = features(spec)
     if table.keys() != episode.columns.keys():
         raise MismatchError("list of columns", f"seed {episode.seed}", [*episode.columns], "the dataset", [*table])
-    columns = {key: episode.columns[key] for key in table}
-    return {key: one.reshape(-1) if table[key]["shape"] == (1,) else one for key, one in columns.items()}
+    return {key: episode.columns[key] for key in table}

@@ -6,6 +6,7 @@ LeRobot writes one file per episode and then copies all earlier episodes into a 
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 from contextlib import closing, suppress
@@ -26,10 +27,14 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.camera import Pictures, open_video
-from manip_il.data.dataset import Dataset
+from manip_il.data.dataset import Dataset, StoredEpisode
+from manip_il.data.info import reading
 from manip_il.data.schema import exact_rate, plain_rate
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import UsageError
+
+# bitexact omits the muxer's version; faststart puts the index at the beginning
+_OPTIONS = {"movflags": "faststart", "fflags": "+bitexact"}
 
 
 @dataclass(frozen=True)
@@ -49,22 +54,29 @@ class CameraFiles:
         self._folder, self._key, self._config, self._fps = folder, key, config, exact_rate(fps)
         self._limit = layout.VIDEO_FILES_SIZE_IN_MB * 2**20
         self._number = self._frames = self._bytes = 0
+        self.encodes = False  # whether pictures were written, not only copied
         self._container: OutputContainer | None = None
         self._stream: VideoStream | None = None
         self._copied: dict[tuple[Dataset, Path], tuple[int, int]] = {}  # chunk and file index
 
-    def copy(self, dataset: Dataset, episode: int) -> VideoSpan:
-        """Copy the video file that holds an episode, unless already copied; return the episode's place in it."""
-        source, first, frames = dataset.clip(self._key, episode)
-        if (dataset, source) not in self._copied:
+    def copy(self, episode: StoredEpisode, *, cut: bool = False) -> VideoSpan:
+        """Copy the video file that holds an episode, unless already copied; return the episode's place in it.
+
+        cut: copy only the episode's frames, to a file of their own.
+        """
+        source, first, frames = episode.clips[self._key]
+        if cut or (episode.dataset, source) not in self._copied:
             self.close()
             name, chunk, file = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
             (self._folder / name).parent.mkdir(parents=True, exist_ok=True)
-            with checks.native_path(source, "an MP4 file") as opened:
-                shutil.copyfile(opened, self._folder / name)
-            self._copied[dataset, source] = chunk, file
+            if cut:
+                _cut(source, self._folder / name, first, frames, episode.dataset.fps)
+            else:
+                with checks.native_path(source, "an MP4 file") as opened:
+                    shutil.copyfile(opened, self._folder / name)
+            self._copied[episode.dataset, source] = chunk, file
             self._number += 1
-        return VideoSpan(*self._copied[dataset, source], first, frames)
+        return VideoSpan(*self._copied[episode.dataset, source], 0 if cut else first, frames)
 
     def write(self, frames: Pictures) -> VideoSpan:
         """Append the frames of an episode. Raises `av.FFmpegError` if they cannot be encoded or written."""
@@ -109,8 +121,7 @@ class CameraFiles:
 
     def _open(self, path: Path, size: tuple[int, int]) -> VideoCodecContext:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # bitexact omits the muxer's version; faststart puts the index at the beginning
-        self._container = av.open(str(path), "w", options={"movflags": "faststart", "fflags": "+bitexact"})
+        self.encodes, self._container = True, av.open(str(path), "w", options=_OPTIONS)
         options = self._config.options()
         self._stream = cast(VideoStream, self._container.add_stream(self._config.vcodec, self._fps, options=options))
         _set_up(self._stream.codec_context, self._config, size, self._fps)
@@ -121,6 +132,25 @@ class CameraFiles:
             packet.stream = cast(VideoStream, self._stream)
             self._bytes += packet.size
             cast(OutputContainer, self._container).mux_one(packet)
+
+
+def _cut(source: Path, target: Path, first: int, count: int, fps: float) -> None:
+    """Copy `count` frames of a video file as they are encoded. Raises `ManipError` if they need frames before them."""
+    with reading(source), closing(open_video(source)) as film, av.open(str(target), "w", options=_OPTIONS) as container:
+        stream = film.streams.video[0]
+        own, rate = (
+            container.add_stream_from_template(stream, opaque=True),
+            fps * float(stream.time_base or 1),
+        )  # [frames/tick]
+        film.seek(round(first / rate), stream=stream)  # to the last key frame at or before it
+        inside = (one for one in film.demux(stream) if one.size and 0 <= round((one.pts or 0) * rate) - first < count)
+        packets = list(itertools.islice(inside, count))
+        if len(packets) != count or not packets[0].is_keyframe:
+            raise ValueError(f"frames {first} to {first + count - 1} cannot be cut out without encoding them again")
+        start = packets[0].pts or 0
+        for one in packets:
+            one.pts, one.dts, one.stream = (one.pts or 0) - start, (one.dts or 0) - start, own
+            container.mux_one(one)
 
 
 def _encode(encoder: VideoCodecContext, frame: av.VideoFrame | None) -> list[Packet]:

@@ -20,7 +20,6 @@ from manip_il.data import schema as s
 from manip_il.data.camera import Camera
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature, Info
-from manip_il.errors import ManipError
 from manip_il.mcap.mapping import TASK, TEXT
 from manip_il.mdp import require_finite
 
@@ -46,20 +45,18 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
     The same dataset gives the same bytes. Raises `NotFiniteError` for NaN and infinity, which JSON lacks, and what
     `Dataset.columns` and `Dataset.camera` raise.
     """
-    columns, texts = _columns(dataset.info), dataset.tasks
+    columns = _columns(dataset.info)
     numbers = [one.key for one in columns if one.dtype not in PICTURES]
     table = dataset.columns([*numbers, layout.TASK_INDEX])
     for key in numbers:
         require_finite(f"{dataset.root}, column {key!r}", table[key])
-    if missing := set(table[layout.TASK_INDEX].tolist()) - set(texts):
-        raise ManipError(f"{dataset.root}: rows have task_index {min(missing)}, which {layout.TASKS} lacks")
+    texts = dataset.texts(table[layout.TASK_INDEX])
     cameras = {one.key: dataset.camera(one.key) for one in columns if one.dtype in PICTURES}
     episodes, rate = dataset.episodes, s.exact_rate(dataset.fps)
     for place, episode in enumerate(episodes.index.tolist()):
         start, stop = int(episodes.start[place]), int(episodes.stop[place])
         times = foxglove.frame_times(stop - start, rate)
-        tasks = [texts[number] for number in table[layout.TASK_INDEX][start:stop].tolist()]
-        channels = {_TASK_TOPIC: foxglove.texts(TASK, tasks, times)}
+        channels = {_TASK_TOPIC: foxglove.texts(TASK, texts[start:stop], times)}
         for one in columns:
             values = _pictures(cameras[one.key], start, stop) if one.key in cameras else table[one.key][start:stop]
             channels[_topic(one.key)] = _messages(one, values, times)

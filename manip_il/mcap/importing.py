@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.data.atomic import new_folder
 from manip_il.data.foxglove import NANOSECONDS, frame_times
-from manip_il.data.lerobot_write import TableWriter
+from manip_il.data.lerobot_write import new_dataset
 from manip_il.data.schema import exact_rate, plain_rate
 from manip_il.errors import ManipError, MismatchError, nearest
 from manip_il.mcap.mapping import TASK, TEXT, Mapping, TopicSource
@@ -45,15 +43,13 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[in
     """
     checks.in_child(str(paths[0]), _read_all, paths, mapping)
     features = _features(next(read_frames(paths[0], mapping)), mapping)
-    about = features, plain_rate(mapping.fps), mapping.robot_type
-    with new_folder(root) as folder, closing(TableWriter(folder, *about)) as writer:
+    with new_dataset(root, features, plain_rate(mapping.fps), mapping.robot_type) as writer:
         for path in paths:
             frames = list(read_frames(path, mapping))
             columns = {key: np.stack([frame[key] for frame in frames]) for key in features}
-            texts = [frame[TASK] for frame in frames]
-            writer.add_columns({key: _column(values, features[key]) for key, values in columns.items()}, texts)
+            texts = {key: columns[key].astype(object) for key in features if features[key]["dtype"] == TEXT}
+            writer.add_columns(columns | texts, [frame[TASK] for frame in frames], {})
             yield len(frames)
-        writer.close_files()
 
 
 def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
@@ -126,12 +122,6 @@ def _features(frame: Frame, mapping: Mapping) -> dict[str, dict[str, Any]]:
         names = ["height", "width", "channels"] if source.is_camera else source.names
         features[key] = {"dtype": dtype, "shape": np.shape(frame[key]) or (1,), "names": names}
     return features
-
-
-def _column(values: NDArray[Any], feature: dict[str, Any]) -> NDArray[Any]:
-    """Return a column's values, as (T,) if each frame has a single number or text."""
-    values = values.reshape(-1) if feature["shape"] == (1,) else values
-    return values.astype(object) if feature["dtype"] == TEXT else values
 
 
 def _times(path: Path, stamps: dict[str, I64], rate: Fraction) -> I64:

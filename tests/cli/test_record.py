@@ -19,6 +19,7 @@ from manip_il.sim import render
 from manip_il.sim.config import Look
 from manip_il.tasks.config import make_config
 
+from ..pictures import read_episodes
 from .made_runs import files
 
 
@@ -78,7 +79,7 @@ def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_o
     assert main(["data", "build", str(journals_of(tmp_path / "one")), str(tmp_path / "again")]) == 0
     assert files(tmp_path / "again") == files(tmp_path / "one")
     frames = Dataset.open(tmp_path / "one").columns(["index"])["index"]
-    episodes = list(Dataset.open(tmp_path / "one").read_episodes())
+    episodes = list(read_episodes(tmp_path / "one"))
     for camera in ("front", "wrist"):
         decoded = np.concatenate([episode.columns[f"observation.images.{camera}"] for episode in episodes])
         assert decoded.shape == (len(frames), 64, 80, 3)

@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from manip_il.collect.edits import label_episode
+from manip_il.collect.edits import label_states
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import journal_of
 from manip_il.data.journal import Journal, list_episodes
+from manip_il.data.schema import SIM_STATE
 from manip_il.mdp import Episode
 from manip_il.tasks.config import EnvConfig
 
@@ -29,8 +30,7 @@ def written(episodes: Iterable[Episode]) -> dict[int, dict[str, bytes]]:
 def label_all(piece: tuple[EnvConfig, Episode]) -> dict[str, Any]:
     """Labels of an episode's states, the last one first."""
     env, episode = piece
-    backwards = replace(episode, columns={key: column[::-1] for key, column in episode.columns.items()})
-    return {key: column[::-1] for key, column in label_episode(env, backwards).items()}
+    return {key: column[::-1] for key, column in label_states(env, episode.columns[SIM_STATE][::-1]).items()}
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ from manip_il.tasks.envs import env_of, scene_of
 from manip_il.tasks.stock.table import ROBOT as STOCK
 
 from ..damage import digests
+from ..pictures import read_episodes
 from ..tables import SCENES, one_arm_per_task
 
 ENV, REACH = make_config("panda", "pick_place"), make_config("fetch", "reach")
@@ -137,7 +138,7 @@ def test_a_dataset_gets_other_pictures_and_keeps_everything_else(demos, tmp_path
         for key, column in before.columns().items():
             np.testing.assert_array_equal(after.columns()[key], column)
         assert (after.spec, after.fingerprint) == (spec, env_fingerprint(ENV, cameras))
-        for episode in after.read_episodes():
+        for episode in read_episodes(root):
             exact = render_states(ENV, cameras, episode.columns[schema.SIM_STATE])
             for key in spec.image_keys:  # but for what the video's compression costs
                 assert np.abs(episode.columns[key].astype(int) - exact[key]).mean() < 4
@@ -145,7 +146,7 @@ def test_a_dataset_gets_other_pictures_and_keeps_everything_else(demos, tmp_path
 
 def redrawn(source: EditSource, root: Path, frames: int, workers: int = 1, **settings) -> list[Episode]:
     redraw_dataset(source, Scenes(SMALL, frames, **settings), EditTarget(root, workers))
-    return list(Dataset.open(root).read_episodes())
+    return list(read_episodes(root))
 
 
 def originals(source: EditSource, seed: int = 0) -> list[State]:
@@ -194,7 +195,7 @@ def test_labels_with_the_servos_sag_keep_it_in_redrawn_scenes_and_lose_it_nowher
     served = open_source(write([sagging], tmp_path / "served", REACH, **about))
     redraw_dataset(served, Scenes(None, 30), EditTarget(tmp_path / "redrawn"))
     expert = make_expert(REACH)
-    for scene in Dataset.open(tmp_path / "redrawn").read_episodes():
+    for scene in read_episodes(tmp_path / "redrawn"):
         label = expert.label(State.from_vector(scene.columns["sim_state"][0]))
         np.testing.assert_allclose(scene.columns["action"][0] - label.action, 0.01, atol=1e-6)
     with pytest.raises(ManipError, match="sag"):
@@ -207,7 +208,7 @@ def test_redrawn_scenes_are_observed_with_noise(visited, tmp_path):
     noisy = Scenes(None, 10, conditions=(Condition("noise", joint_noise=0.05),))
     redraw_dataset(visited, noisy, EditTarget(tmp_path / "noisy"))
     env = env_of(visited.env)
-    for scene in Dataset.open(tmp_path / "noisy").read_episodes():
+    for scene in read_episodes(tmp_path / "noisy"):
         env.set_state(State.from_vector(scene.columns["sim_state"][0]))
         assert 0.01 < np.abs(scene.columns["observation.state"][0] - env.observe().state).max() < 0.5
 

@@ -17,6 +17,8 @@ from manip_il.data.journal import Journal, read_journal
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.mdp import Episode
 
+from ..pictures import read_episodes
+
 RED, BLUE = "Put the red cube into its bin.", "Put the blue cube into its bin."
 TEXTS = [RED, BLUE, RED]
 
@@ -33,7 +35,7 @@ def root(tmp_path: Path, told: list[Episode], spec: s.RobotTaskSpec) -> Path:
 
 
 def texts(root: Path) -> list[str]:
-    return [episode.instruction for episode in Dataset.open(root).read_episodes()]
+    return [episode.instruction for episode in read_episodes(root)]
 
 
 def test_each_text_is_one_task_and_every_frame_has_its_own(root, spec):

@@ -19,8 +19,10 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from manip_il.cli.main import main
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
 from manip_il.doctor.examine import examine_folder
+from manip_il.errors import MismatchError
 from manip_il.learn.policy import LearnedPolicy
 
 from ..damage import DATA, EPISODES, edit_json, edit_table
@@ -28,6 +30,7 @@ from ..learn.tiny_policies import ACT, DIFFUSION
 
 pytestmark = pytest.mark.slow
 TOP, SIDE, DEPTH = "observation.images.top", "observation.image", "observation.images.depth"
+FRONT = "observation.images.front"
 MOTORS = {"motors": ["shoulder_pan.pos", "elbow.pos", "gripper"]}
 NAMES = ["height", "width", "channels"]
 SIZE = (32, 48)
@@ -211,3 +214,75 @@ def test_an_mlp_reads_what_is_there_beside_pictures(root, tmp_path):
     assert LearnedPolicy.load(tmp_path / "run/checkpoints/last/pretrained_model").checkpoint.numbers == {
         "observation.state": 3
     }
+
+
+@pytest.fixture(scope="module")
+def annotated(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two datasets with depth and LeRobot's columns of language."""
+    depth = {"dtype": "video", "shape": (*SIZE, 1), "names": NAMES, "info": {"is_depth_map": True}}
+    folder = tmp_path_factory.mktemp("annotated")
+    roots = [record(folder / name, tasks, **{DEPTH: depth}) for name, tasks in (("a", ["fold"] * 3), ("b", ["un"] * 2))]
+    for root in roots:
+        language(root)
+    return roots
+
+
+def items(root: Path) -> list[dict[str, Any]]:
+    """What LeRobot's own loader returns, without the numbers of rows, episodes and texts."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    numbers = {"index", "episode_index", "task_index"}
+    dataset: Any = LeRobotDataset("a/b", root=root)
+    found = [{key: value for key, value in one.items() if key not in numbers} for one in map(dict, dataset)]
+    return [{key: getattr(value, "tolist", lambda value=value: value)() for key, value in one.items()} for one in found]
+
+
+def test_merged_datasets_of_others_are_for_lerobot_those_of_their_frames(annotated, tmp_path):
+    assert main(["data", "merge", *map(str, annotated), f"--output={tmp_path / 'both'}"]) == 0
+    assert items(tmp_path / "both") == [one for root in annotated for one in items(root)]
+    assert examine_folder(tmp_path / "both") == []
+    assert not (tmp_path / "both" / layout.OURS).exists()
+    features = json.loads((annotated[0] / layout.INFO).read_text())["features"]
+    assert json.loads((tmp_path / "both" / layout.INFO).read_text())["features"] == features
+
+
+def test_chosen_episodes_are_taken_with_their_part_of_the_films(annotated, tmp_path):
+    words = ["data", "merge", *map(str, annotated), "--dataset.episodes=[1,3:5]", f"--output={tmp_path / 'part'}"]
+    assert main(words) == 0
+    first, second = map(items, annotated)
+    assert items(tmp_path / "part") == first[12:25] + second
+    assert examine_folder(tmp_path / "part") == []
+    assert main(["data", "merge", str(annotated[0]), "--dataset.episodes=2:9", f"--output={tmp_path / 'no'}"]) == 2
+
+
+def test_a_camera_is_renamed_where_it_has_another_name(root, recorded, tmp_path):
+    names = json.dumps({TOP: FRONT})
+    assert main(["data", "merge", str(root), f"--rename_map={names}", f"--output={tmp_path / 'front'}"]) == 0
+    both = [str(recorded), str(tmp_path / "front")]
+    assert main(["data", "merge", *both, f"--output={tmp_path / 'no'}"]) == 1
+    assert main(["data", "merge", *both, f"--rename_map={names}", f"--output={tmp_path / 'both'}"]) == 0
+    merged, before = Dataset.open(tmp_path / "both"), Dataset.open(recorded)
+    assert merged.cameras == [FRONT]
+    pictures = before.frames(TOP, np.arange(len(before)))
+    np.testing.assert_array_equal(merged.frames(FRONT, np.arange(len(merged))), np.concatenate([pictures] * 2))
+    assert examine_folder(tmp_path / "both") == []
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda info: info.update(fps=29.97), "fps differs: .*/plain has 29.97, .*/plain has 30.0"),
+        (lambda info: info["features"].pop("action"), "column action differs: .*/plain has none"),
+        (
+            lambda info: info["features"][TOP]["info"].update({"video.codec": "h264"}),
+            f"film {TOP}: video.codec differs",
+        ),
+        (lambda info: info["features"][TOP].update(shape=[24, 32, 3]), f"column {TOP} differs: .*24, 32, 3"),
+        (lambda info: info.update(robot_type="koch"), "robot_type differs: .*/plain has koch, .*/plain has none"),
+    ],
+)
+def test_what_a_merge_cannot_keep_is_refused_by_name(root, recorded, tmp_path, change, what):
+    edit_json(root / layout.INFO, change)
+    with pytest.raises(MismatchError, match=what):
+        merge_datasets([root, recorded], tmp_path / "both", repo_id="a/b")
+    assert not (tmp_path / "both").exists()
