@@ -24,6 +24,7 @@ from manip_il.data.atomic import new_folder
 from manip_il.data.camera import decode_picture
 from manip_il.data.dataset import Own, StoredEpisode
 from manip_il.data.info import PICTURES, Info, read_info
+from manip_il.data.ownership import DATASET
 from manip_il.data.parquet_files import Column, ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, features, ordered_columns
 from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, pool, to_lists
@@ -52,8 +53,8 @@ def write_dataset(
     """Write the episodes, in order, as a dataset with our columns; return its `info.json`.
 
     The dataset appears when it is complete. Episodes are taken one by one and not kept; the same ones in the same order
-    give the same bytes, videos included. provenance: origin of the episodes, read after the last episode. replace: replace
-    in `new_folder`; otherwise, if `root` is not empty, raises `FolderExistsError` before taking an episode. Also raises
+    give the same bytes, videos included. provenance: origin of the episodes, read after the last episode. replace: replace a
+    dataset of ours; otherwise, if `root` is not empty, raises `FolderExistsError` before taking an episode. Also raises
     what `ordered_columns` raises, and `ManipError` if there are no episodes or the disk is full.
     """
     about = Own(spec, fingerprint, {} if provenance is None else provenance), repo_id
