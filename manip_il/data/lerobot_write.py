@@ -53,9 +53,9 @@ def write_dataset(
     """Write the episodes, in order, as a dataset with our columns; return its `info.json`.
 
     The dataset appears when it is complete. Episodes are taken one by one and not kept; the same ones in the same order
-    give the same bytes, videos included. provenance: origin of the episodes, read after the last episode. replace: replace a
-    dataset of ours; otherwise, if `root` is not empty, raises `FolderExistsError` before taking an episode. Also raises
-    what `ordered_columns` raises, and `ManipError` if there are no episodes or the disk is full.
+    give the same bytes, videos included. provenance: origin of the episodes, read after the last episode. replace:
+    replace a dataset of ours; otherwise, if `root` is not empty, raises `FolderExistsError` before taking an episode.
+    Also raises what `ordered_columns` raises, and `ManipError` if there are no episodes or the disk is full.
     """
     about = Own(spec, fingerprint, {} if provenance is None else provenance), repo_id
     robot = spec.robot_type or spec.robot
