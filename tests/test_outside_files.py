@@ -19,6 +19,7 @@ ALLOWED = {
     "cli/main.py": "os.devnull",
     "cli/outputs.py": "the folder that a command is about to write",
     "collect/ray_pool.py": "what this process opened before it sends it to a node",
+    "data/fingerprint.py": "the kernel's files of the processor",
     "data/atomic.py": "locks and flushes what it writes",
     "learn/ppo.py": "the state of a run's own last checkpoint",
     "robots/files.py": "a user's model, after its included files were read",

@@ -296,7 +296,7 @@ def _facts(dataset: Dataset, names: Mapping[str, str]) -> dict[str, str]:
     for key in {key for row in dataset.episodes.others for key in row} - {layout.DRAWN}:
         facts[f"column {key} of meta/episodes"] = "a column"
     for path in dataset.other_tables:
-        facts[f"meta/{path.name}"] = f"sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+        facts[f"meta/{path.name}"] = f"sha256 {file_sha256(path).hex()}"
     return facts
 
 

@@ -99,7 +99,8 @@ def new_dataset(
         yield writer
         writer.close_files()
         for path in tables:
-            shutil.copyfile(path, folder / "meta" / path.name)
+            with checks.native_path(path, "a table") as opened:
+                shutil.copyfile(opened, folder / "meta" / path.name)
         if own is not None:
             ours = {"format": _FORMAT, "repo_id": repo_id, "spec": own.spec.to_json()}
             ours |= {"fingerprint": dict(own.fingerprint), "provenance": dict(own.provenance)}

@@ -78,7 +78,7 @@ class Hub:
         """Return the current version; None if the repository or the revision does not exist."""
         with explained(f"read {self.name}"):
             try:
-                about = self._api.repo_info(**self._repo, revision=self._revision)
+                about: Any = self._api.repo_info(**self._repo, revision=self._revision)
             except (RepositoryNotFoundError, RevisionNotFoundError):
                 return None
             head = about.sha or ""
@@ -111,7 +111,7 @@ class Hub:
             except RemoteEntryNotFoundError:
                 named = _OF_A_DATASET if self.kind == "dataset" else ()
                 return {path: file for path, file in before.files.items() if path.startswith(named)}
-            pushed = dict(Manifest.from_json(path.read_bytes(), before.version).files)
+            pushed = dict(Manifest.from_json(checks.read_bytes(path, "a manifest"), before.version).files)
             if (there := before.files.get(CARD)) and CARD in pushed:
                 card = self._download(CARD, before.version, Path(folder), there.size)
                 if not pushed[CARD].fits(card):

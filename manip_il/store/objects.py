@@ -50,10 +50,10 @@ class Local(LocalFileSystem):
     """This machine's files, of which a pull reads only regular ones."""
 
     @override
-    def get_file(self, rpath: Any, lpath: Any, callback: Any = None, **kwargs: Any) -> None:
+    def get_file(self, path1: Any, path2: Any, callback: Any = None, **kwargs: Any) -> None:
         """Copy a file and count its bytes."""
-        with checks.open_outside(Path(rpath), "a file of a push", RemoteError) as source:
-            _copy(source, lpath, callback)
+        with checks.open_outside(Path(path1), "a file of a push", RemoteError) as source:
+            _copy(source, path2, callback)
 
 
 class Sftp(SFTPFileSystem):

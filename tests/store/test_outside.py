@@ -114,7 +114,8 @@ def test_a_file_that_is_larger_than_the_list_says_is_not_taken(scheme, endless, 
         sha256 = hashlib.sha256((run / "new.txt").read_bytes()).hexdigest()
         name = f"objects/{sha256[:2]}/{sha256}"
     if scheme == "s3":
-        open_remote(url)._fs.pipe_file(f"{url}/{name}", bytes(4 * most))
+        remote: Any = open_remote(url)
+        remote._fs.pipe_file(f"{url}/{name}", bytes(4 * most))
     else:
         (store / name).unlink()
         (store / name).symlink_to("/dev/zero")
