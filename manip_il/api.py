@@ -17,6 +17,7 @@ from manip_il.algorithms.config import BetaSchedule, RunConfig, check_labels
 from manip_il.algorithms.results import Result
 from manip_il.algorithms.run import Run
 from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.environments import is_known
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import parse_query
 from manip_il.collect.record import MAX_TRIES, collect, collect_successes, provenance
@@ -33,7 +34,7 @@ from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.seeding import stream_base, stream_seeds
 from manip_il.sim.conditions import NOMINAL
-from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.config import EnvConfig, stored_config
 
 Policy = Checkpoint | Path | str
 
@@ -145,7 +146,12 @@ def evaluate(
         origin = None if path is None else Checkpoint.open(path).origin
         if origin is None:
             raise UsageError("env is missing, and the policy does not name one")
-        env = make_config(origin.robot, origin.task, origin.fps, object=origin.object)
+        if not is_known(origin.robot, origin.task, origin.object):
+            named = " ".join(filter(None, (origin.robot, origin.task, origin.object)))
+            raise UsageError(
+                f"the policy is for {named}, which is not built in; give env=make_config(...) with your files"
+            )
+        env = stored_config(origin)
     driver = RolloutJob.driver if path is None else PolicyDriver((path,))
     chosen: dict[str, Any] = {"hold": episode_hold(env), "label": "last"} | options
     job = RolloutJob(env, driver, **chosen)

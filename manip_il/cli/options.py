@@ -1,6 +1,7 @@
 """Options of commands: the fields of their dataclasses, the values that a type accepts, and their names in help.
 
-A field's type is int, float, bool, str, Path or a `Literal` of names; one of these or None; a list of one of these; a
+A field's type is int, float, bool, str, Path, `str | Path` (a name, or a file if `typed` says so) or a `Literal` of
+names; one of these or None; a list of one of these; a
 class with `parse` and `__str__` (`linear:5`); another dataclass (a group, `--dataset.root`); or `Open`: a dict of a
 group whose options only another program knows (`--policy.*`). `given(Config)` is a dict of the options of `Config` that
 the user gave; the command makes a `Config` from them.
@@ -11,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import operator
 import re
 import shlex
 import sys
@@ -22,10 +24,12 @@ from pathlib import Path
 from typing import Any, Literal, Union
 
 from manip_il.checks import parse_yaml
+from manip_il.option import typed
 
 Open = dict[str, Any]  # option -> value as read by YAML
 Given = dict[str, Any]  # field -> value
-_METAVARS = {int: "INT", float: "FLOAT", bool: "true|false", str: "TEXT", Path: "PATH"}
+_NAMED = str | Path  # see `typed`
+_METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", bool: "true|false", str: "TEXT", Path: "PATH", _NAMED: "TEXT"}
 
 
 def group(default: Any, prefix: str | None = None) -> Any:
@@ -195,6 +199,8 @@ def decode(option_type: Any, value: Any) -> Any:
         return some.parse(value)
     if some == list[Path] and isinstance(value, str):
         value = [value]
+    if some == _NAMED:
+        return typed(_expand(draccus.decode(str, value)))
     decoded: Any = draccus.decode(option_type, value)
     if decoded != decoded or (isinstance(value, bool) and some is not bool) or (some is Path and value == ""):
         raise ValueError
@@ -210,6 +216,7 @@ def _expand(value: Any) -> Any:
 
 def without_none(option_type: Any) -> Any:
     """Return `X` of `X | None`, and any other type as it is."""
-    if typing.get_origin(option_type) not in (Union, types.UnionType):
+    members = typing.get_args(option_type)
+    if typing.get_origin(option_type) not in (Union, types.UnionType) or types.NoneType not in members:
         return option_type
-    return next(member for member in typing.get_args(option_type) if member is not types.NoneType)
+    return functools.reduce(operator.or_, (member for member in members if member is not types.NoneType))

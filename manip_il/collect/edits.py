@@ -32,7 +32,7 @@ from manip_il.errors import ManipError, MismatchError, NothingToLearnError, Rend
 from manip_il.mdp import Episode, State
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.variation import OLDER
-from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.config import EnvConfig, complete
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 Columns = dict[str, NDArray[Any]]
@@ -58,12 +58,17 @@ class EditSource:
             raise ManipError(f"the labels in {self.dataset.root} hold the sag of serve's servos; {what} would drop it")
 
 
-def open_source(root: Path, robot: str | None = None, task: str | None = None, shape: str | None = None) -> EditSource:
+def open_source(
+    root: Path,
+    robot: str | Path | None = None,
+    task: str | Path | None = None,
+    shape: str | Path | None = None,
+) -> EditSource:
     """Open a dataset whose states are to be restored.
 
-    robot, task: files of the user's own robot and task. shape: as in `EnvConfig.object`, if the object is a mesh.
+    robot, task, shape: as in `EnvConfig`, for a robot, a task or a mesh of the user's own.
     Raises `ManipError` if the folder is not a dataset of ours, `MismatchError` if it is for another robot, task or
-    object, and what `make_config` raises for a robot, task or object that is not built in.
+    object, and what `complete` raises for a robot, task or object that is not built in.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
@@ -71,7 +76,8 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
         raise ManipError(
             f"{root} has no {OURS}, which LeRobot's tools drop: copy it from the dataset that this one was made from"
         )
-    env = make_config(robot or spec.robot, task or spec.task, spec.fps, object=shape or spec.object)
+    robot, task, shape = robot or spec.robot, task or spec.task, shape or spec.object
+    env = complete(EnvConfig(spec.fps, robot=robot, task=task, object=shape))
     given = env_spec(env)
     for what in ("robot", "task", "object"):
         if getattr(given, what) != getattr(spec, what):

@@ -25,11 +25,10 @@ from manip_il.robots.table import get_robot, is_robot
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import environment_state_names
-from manip_il.sim.mesh import is_stored
 from manip_il.sim.points import point_names
 from manip_il.sim.props import VERSION as DRAWN
 from manip_il.sim.scene import SCENES_KEPT
-from manip_il.sim.shape import Shape, stored
+from manip_il.sim.shape import MESH, Shape, stored
 from manip_il.sim.task import phases
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene, env_of
@@ -44,7 +43,7 @@ def is_known(robot: str, task: str, shape: str = "") -> bool:
     """Return whether this robot, task and object are built in."""
     if robot in STOCK:
         return task in STOCK[robot].tasks
-    return is_robot(robot) and is_task(task) and not is_stored(shape)
+    return is_robot(robot) and is_task(task) and not shape.startswith(MESH)
 
 
 def make_env(
@@ -52,14 +51,14 @@ def make_env(
 ) -> Environment:
     """Make an environment. Raises `UsageError` for cameras or conditions that it does not support."""
     if config.robot in STOCK:
-        return make_stock(config.robot, config.task, cameras, conditions)
+        return make_stock(*_stock_names(config), cameras, conditions)
     return env_of(config, cameras, conditions)
 
 
 @lru_cache(SCENES_KEPT)
 def make_expert(config: EnvConfig) -> Labeller:
     """Return the expert of an environment, cached."""
-    return make_stock_expert(config.robot, config.task) if config.robot in STOCK else Expert(config_scene(config))
+    return make_stock_expert(*_stock_names(config)) if config.robot in STOCK else Expert(config_scene(config))
 
 
 @cache
@@ -69,14 +68,14 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
     pictures: dict[str, Any] = {"cameras": cameras.names, "image_size": cameras.size} if cameras else {}
     if config.robot in STOCK:
         robot = STOCK[config.robot]
-        stock = robot.tasks[config.task]
+        stock = robot.tasks[str(config.task)]
         return RobotTaskSpec(
-            robot=config.robot,
+            robot=str(config.robot),
             task=stock.name,
             fps=config.control_hz,
             joint_names=robot.joint_names,
             environment_state_names=stock.observed,
-            sim_state_size=len(described_stock(config.robot, config.task).get_state().to_vector()),
+            sim_state_size=len(described_stock(*_stock_names(config)).get_state().to_vector()),
             instruction=stock.instruction,
             action_meaning=robot.action_meaning,
             phases=stock.phases,
@@ -103,16 +102,20 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
 
 def env_actions(config: EnvConfig) -> ActionSpace:
     """Return names, bounds and scale of an environment's actions, (n,)."""
-    return (described_stock(config.robot, config.task) if config.robot in STOCK else config_scene(config)).actions
+    return (described_stock(*_stock_names(config)) if config.robot in STOCK else config_scene(config)).actions
 
 
 def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:
     """Return package versions, processor, and hashes of the compiled model and of environment and camera settings."""
     if cameras is None:
         return dict(_fingerprint(config))
-    drawn = DRAWN + (config.task.partition(":")[0] in _TURNED)
+    drawn = DRAWN + (str(config.task).partition(":")[0] in _TURNED)
     look = hashlib.sha256(f"{canonical_json(cameras)} {drawn}".encode()).hexdigest()
     return {**_fingerprint(config), "cameras_sha256": look}
+
+
+def _stock_names(config: EnvConfig) -> tuple[str, str]:
+    return str(config.robot), str(config.task)
 
 
 @cache
@@ -131,5 +134,5 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
         settings["object"], own = stored(config.object), own | ({"object_sha256": mesh.sha256} if mesh else {})
     if not config.object:  # as in fingerprints of versions that had no `object`
         del settings["object"]
-    made = described_stock(config.robot, config.task) if config.robot in STOCK else config_scene(config)
+    made = described_stock(*_stock_names(config)) if config.robot in STOCK else config_scene(config)
     return environment_fingerprint(model_bytes(made.model), settings) | own

@@ -71,6 +71,7 @@ class RobotTaskSpec:
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
         checks.task_name(self.task)
+        checks.object_name(self.object)
         for camera in self.cameras:
             checks.name("a camera", camera)
 

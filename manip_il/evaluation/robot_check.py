@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -75,7 +76,7 @@ class RobotCheck:
     while it points down.
     """
 
-    name: str
+    name: str | Path
     robot: Robot
     opening: float
     table: float
@@ -89,7 +90,7 @@ class RobotCheck:
     def to_json(self) -> dict[str, Any]:
         """Return the contents of `check.json`."""
         return {
-            "robot": self.name,
+            "robot": str(self.name),
             "hand": self.robot.hand,
             "gripper": {"joints": self.robot.gripper.joints, "opening": self.opening},
             "reach": {"table": self.table},
@@ -98,7 +99,11 @@ class RobotCheck:
 
 
 def check_robot(
-    name: str, tasks: Sequence[str], episodes: int, engine: Engine, on_result: Callable[[EpisodeResult], object]
+    name: str | Path,
+    tasks: Sequence[str],
+    episodes: int,
+    engine: Engine,
+    on_result: Callable[[EpisodeResult], object],
 ) -> RobotCheck:
     """Measure a robot, given by name or YAML, on tasks. episodes: per task without random actions, and as many with.
 
@@ -118,7 +123,7 @@ def check_robot(
     return RobotCheck(name, robot, scene.gripper.most, table, tuple(checked))
 
 
-def check_starts(name: str, task: str) -> TaskCheck:
+def check_starts(name: str | Path, task: str) -> TaskCheck:
     """Draw up to `STARTS` starts of a task with a robot, as episodes do; stop at one without a valid placement."""
     the_task, starts = get_task(task), 0
     try:
@@ -223,7 +228,7 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def looks(name: str) -> tuple[Film, ...]:
+def looks(name: str | Path) -> tuple[Film, ...]:
     """Return pictures of a robot in its home pose, with the axes of its frame `ee`.
 
     Raises `RenderError` without off-screen OpenGL.

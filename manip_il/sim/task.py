@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import mujoco
@@ -169,8 +170,8 @@ class TakesShape(Protocol):
 class TakesArgument(Protocol):
     """A task with variants, called `NAME:ARGUMENT`; the state holds an episode's variant."""
 
-    def with_argument(self, text: str) -> Task:
-        """Return the variant that a text describes; its name is `NAME` or `NAME:A=NUMBER,B=NUMBER`."""
+    def with_argument(self, text: str | Path) -> Task:
+        """Return the variant that a text or a file describes; its name is `NAME` or `NAME:A=NUMBER,B=NUMBER`."""
         ...
 
     @property

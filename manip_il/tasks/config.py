@@ -8,7 +8,7 @@ from typing import Any
 
 from manip_il.checks import check_unchanged
 from manip_il.errors import UnknownName, UsageError
-from manip_il.option import option
+from manip_il.option import option, typed
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import MOST_HZ, Episodes
 from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
@@ -30,12 +30,14 @@ TASK_HELP = (
 class EnvConfig(Episodes):
     """Settings of one environment; every field is part of the fingerprint. `make_config` checks and completes them.
 
-    object: shape and size of what is grasped, as `Shape.parse` reads it; empty for the task's default.
+    robot, task: a name, or the `Path` of a user's own file. object: shape and size of what is grasped, as `Shape.parse`
+    reads it, or the `Path` of a mesh; empty for the task's default. A name that was stored is a `str`, which no code
+    takes for a path.
     """
 
-    robot: str = option("panda", ROBOT_HELP, flag="robot.type")
-    task: str = option("pick_place", TASK_HELP, flag="task.type")
-    object: str = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
+    robot: str | Path = option("panda", ROBOT_HELP, flag="robot.type")
+    task: str | Path = option("pick_place", TASK_HELP, flag="task.type")
+    object: str | Path = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
 
     @property
     def name(self) -> str:
@@ -44,13 +46,36 @@ class EnvConfig(Episodes):
 
 
 def make_config(
-    robot: str = EnvConfig.robot, task: str = EnvConfig.task, control_hz: int = 0, **settings: Any
+    robot: str | Path = EnvConfig.robot,
+    task: str | Path = EnvConfig.task,
+    control_hz: int = 0,
+    **settings: Any,
 ) -> EnvConfig:
     """Return the settings of an environment; what is not given comes from its robot and task.
 
-    settings: other `EnvConfig` fields. Raises `UnknownName` (robot or task) or `UsageError` (a wrong value).
+    This function is for what a person wrote: names that end in `.py` or `.yaml` and objects `mesh:FILE` are paths. What
+    is stored goes to `complete`, where a `str` is a name.
+
+    Args:
+        robot: Its name, or the path of its YAML.
+        task: Its name, or the path of its Python file.
+        control_hz: Control steps per second; 0 for the robot's own.
+        settings: Other fields of `EnvConfig`.
+
+    Raises:
+        UnknownName: for a robot or a task.
+        UsageError: for a wrong value.
     """
-    return complete(EnvConfig(robot=robot, task=task, control_hz=control_hz, **settings))
+    settings |= {"robot": typed(robot), "task": typed(task), "object": typed(settings.get("object", ""))}
+    return complete(EnvConfig(control_hz, **settings))
+
+
+def stored_config(spec: Any) -> EnvConfig:
+    """Return the settings of the environment that a dataset or a policy names, of which no file is opened.
+
+    spec: a `RobotTaskSpec` or an `Origin`. Raises what `make_config` raises if the environment is not built in.
+    """
+    return complete(EnvConfig(spec.fps, robot=spec.robot, task=spec.task, object=spec.object))
 
 
 def complete(config: EnvConfig) -> EnvConfig:
@@ -79,15 +104,16 @@ def _with_task(config: EnvConfig) -> EnvConfig:
     from manip_il.tasks.table import get_task
 
     task, robot = get_task(config.task), get_robot(config.robot)
-    for file in (config.task, config.robot, mesh_path(config.object) or ""):
-        if Path(file).suffix:
-            check_unchanged(Path(file))
+    for file in (config.task, config.robot, mesh_path(config.object)):
+        if isinstance(file, Path):
+            check_unchanged(file)
     if isinstance(task, TakesArgument):
         config = replace(config, task=task.name)
     if config.object:
         shape, other = Shape.parse(config.object), get_task(config.task, config.object)
         is_own = shape == getattr(task, "shape", CUBE)
-        task, config = task if is_own else other, replace(config, object="" if is_own else str(shape))
+        named = config.object if isinstance(config.object, Path) else str(shape)
+        task, config = task if is_own else other, replace(config, object="" if is_own else named)
     limits, control_hz = task.limits, config.control_hz or robot.fps
     rate = control_hz / LIMITS_HZ
     return replace(
@@ -103,7 +129,7 @@ def _of_stock(config: EnvConfig) -> EnvConfig:
     """Return settings with the stock robot's fixed values; raises `UsageError` if another value was given."""
     robot = stock.ROBOTS[config.robot]
     if config.task not in robot.tasks:
-        raise UnknownName(f"task of {config.robot}", config.task, robot.tasks)
+        raise UnknownName(f"task of {config.robot}", str(config.task), robot.tasks)
     if config.object:
         raise UsageError(f"object is {config.object}; {config.robot} is unmodified, so omit --task.object")
     for name, value in robot.fixed.items():

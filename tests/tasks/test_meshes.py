@@ -61,14 +61,15 @@ def test_other_tasks_take_it_too(task, folder):
 def test_every_kind_of_file_is_the_same_solid(ending, tmp_path):
     path, solid = tmp_path / f"angle{ending}", MESHES["angle"]()
     solid.export(path, file_type="stl_ascii" if "ascii" in ending else None)
-    shape = Shape.parse(f"mesh:{path}:0.05")
+    shape = Shape.parse(Path(f"mesh:{path}:0.05"))
     assert max(shape.lengths) == pytest.approx(0.05)
     assert shape.mass == pytest.approx(max(LIGHTEST, DENSITY * solid.volume * (0.05 / 0.07) ** 3), rel=1e-5)
     np.testing.assert_allclose(shape.mesh.vertices.min(axis=0), np.array((-0.0275, -0.0225, -0.0125)) / 1.4, atol=1e-6)
 
 
 def test_the_model_has_its_mass_its_centre_of_mass_and_its_picture(folder):
-    shape, scene = Shape.parse(text(folder, "bottle")), scene_of("panda", "pick_place", text(folder, "bottle"))
+    bottle = Path(text(folder, "bottle"))
+    shape, scene = Shape.parse(bottle), scene_of("panda", "pick_place", bottle)
     one, model = scene.objects[OBJECT], scene.model
     assert model.body_mass[one.body] == pytest.approx(shape.mass) == pytest.approx(DENSITY * MESHES["bottle"]().volume)
     np.testing.assert_allclose(model.body_ipos[one.body], 0, atol=1e-5)
@@ -153,7 +154,7 @@ def test_a_node_gets_the_file(folder, tmp_path):
     job = RolloutJob(make_config("panda", object=f"mesh:{path}"), hold=0)
     [here], files = list(job.run([5])), {"wedge.obj": path.read_bytes()}
     path.unlink()
-    away = replace(job, env=replace(job.env, object=f"mesh:{tmp_path / 'elsewhere' / 'wedge.obj'}"))
+    away = replace(job, env=replace(job.env, object=Path(f"mesh:{tmp_path / 'elsewhere' / 'wedge.obj'}")))
     [(there, _)] = pickle.loads(zstandard.decompress(run_there(manip_il.__version__, away, (5,), None, None, files)))
     for name, column in here.without_pictures().columns.items():
         np.testing.assert_array_equal(there.columns[name], column)

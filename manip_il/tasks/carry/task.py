@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Self
 
 import mujoco
@@ -131,8 +132,8 @@ class Carry(PickPlace):
         """Return the task with another object."""
         return replace(super().with_shape(shape), limits=Limits(horizon=200 if shape == CUBE else 300))
 
-    def with_argument(self, text: str) -> Self:
-        """Return the task with the reward that a text describes; the task's name lists its nonzero weights."""
+    def with_argument(self, text: str | Path) -> Self:
+        """Return the task with the reward that a text or a file describes; its name lists the nonzero weights."""
         reward = Reward.parse(text)
         return replace(self, name=NAME if reward == TASTES[DEFAULT] else f"{NAME}:{reward.numbers}", reward=reward)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 
 from manip_il.errors import UsageError
 from manip_il.sim.conditions import Condition
@@ -36,7 +37,7 @@ def make_stock_expert(robot: str, task: str) -> StockLabeller:
     return AlohaExpert(task) if robot == ALOHA else StockExpert(task)
 
 
-def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
+def check_cameras(robot: str | Path, cameras: CameraConfig | None) -> None:
     """Raise `UsageError` for cameras that a robot, stock or not, does not have."""
     known = ROBOTS[robot].cameras if robot in ROBOTS else CAMERAS
     if cameras is not None and not known:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from manip_il.sim.config import OTHERS
 
@@ -142,7 +143,7 @@ class StockRobot:
     ends_solved: bool = field(default=False, kw_only=True)
 
 
-ROBOTS = {
+ROBOTS: dict[str | Path, StockRobot] = {
     ROBOT: StockRobot(
         STOCK,
         STATE_NAMES,
