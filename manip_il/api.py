@@ -147,9 +147,9 @@ def evaluate(
         if origin is None:
             raise UsageError("env is missing, and the policy does not name one")
         if not is_known(origin.robot, origin.task, origin.object):
-            named = " ".join(filter(None, (origin.robot, origin.task, origin.object)))
             raise UsageError(
-                f"the policy is for {named}, which is not built in; give env=make_config(...) with your files"
+                f"the policy is for the robot {origin.robot} and the task {origin.task} of your own, of which it holds "
+                "only the names; give env=make_config(...) with your files"
             )
         env = stored_config(origin)
     driver = RolloutJob.driver if path is None else PolicyDriver((path,))

@@ -10,10 +10,11 @@ from typing import Any
 
 from manip_il.errors import UsageError
 
+NameOrPath = str | Path  # of a robot, a task or an object: only a `Path` is ever opened, see `typed`
 _FILES = (".py", ".yaml", ".yml", ".json")  # suffixes of files with a user's own task, robot or reward
 
 
-def typed(text: str | Path) -> str | Path:
+def typed(text: NameOrPath) -> NameOrPath:
     """Return a robot, a task or an object that a person typed: a `Path` if it names a file, else the name itself.
 
     Only a `Path` is ever opened. What a dataset, a checkpoint or a result names is a `str`, which is looked up among

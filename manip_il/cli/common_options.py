@@ -11,6 +11,7 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
+from manip_il.sim.shape import MESH
 from manip_il.tasks.config import EnvConfig, complete
 from manip_il.tasks.stock import table as stock
 
@@ -46,8 +47,11 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
     return complete(EnvConfig(**values))
 
 
-def own_files(robot: str, task: str) -> list[str]:
-    """Return the options, with FILE for a path, that commands need for a robot or a task that is not built in."""
+def own_files(robot: str, task: str, shape: str = "") -> list[str]:
+    """Return the options, with FILE for a path, that commands need for what a dataset or a policy only names.
+
+    robot, task, shape: as in a `RobotTaskSpec`.
+    """
     from manip_il.data.dataset import UNKNOWN_TASK
     from manip_il.robots.table import is_robot
     from manip_il.tasks.table import is_task
@@ -55,7 +59,8 @@ def own_files(robot: str, task: str) -> list[str]:
     if robot in stock.ROBOTS or task == UNKNOWN_TASK:
         return []
     robots = [] if is_robot(robot) else ["--robot.type=FILE.yaml"]
-    return robots + ([] if is_task(task) else ["--task.type=FILE.py"])
+    meshes = ["--task.object=mesh:FILE:LENGTH"] if shape.startswith(MESH) else []
+    return [*robots, *([] if is_task(task) else ["--task.type=FILE.py"]), *meshes]
 
 
 def env_options(env: EnvConfig) -> list[str]:

@@ -13,7 +13,7 @@ from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import ResumableOutput, publish
 from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.data.atomic import write_file
-from manip_il.errors import ManipError, MismatchError, UsageError, shorten
+from manip_il.errors import ManipError, UsageError, shorten
 from manip_il.option import Seeded, option
 from manip_il.tasks.config import EnvConfig
 
@@ -184,12 +184,11 @@ class EvalOptions(Tested, Seeded, Trusting):
         from manip_il.collect.job import RolloutJob
         from manip_il.data.fingerprint import compare_fingerprints, policy_sha256
         from manip_il.evaluation.policy_folder import find_policy
+        from manip_il.evaluation.results import require_equal
 
         settings, own = result.settings, self.env
         env = settings.env(own["robot"] or result.robot, own["task"] or result.task, own["object"])
-        for what in ("robot", "task"):
-            if (given := getattr(env_spec(env), what)) != getattr(result, what):
-                raise MismatchError(what, str(file), getattr(result, what), f"--{what}.type", given)
+        require_equal(str(file), result, "what is given", env_spec(env), "robot", "task")
         if self.policy.path is None and result.policy not in NO_FILES:
             raise UsageError(f"{file} evaluates the policy {shorten(result.policy)}; give that with --policy.path=DIR")
         path = None if self.policy.path is None else find_policy(self.policy.path)

@@ -1,10 +1,9 @@
 """Options of commands: the fields of their dataclasses, the values that a type accepts, and their names in help.
 
-A field's type is int, float, bool, str, Path, `str | Path` (a name, or a file if `typed` says so) or a `Literal` of
-names; one of these or None; a list of one of these; a
-class with `parse` and `__str__` (`linear:5`); another dataclass (a group, `--dataset.root`); or `Open`: a dict of a
-group whose options only another program knows (`--policy.*`). `given(Config)` is a dict of the options of `Config` that
-the user gave; the command makes a `Config` from them.
+A field's type is int, float, bool, str, Path, `NameOrPath` or a `Literal` of names; one of these or None; a list of one
+of these; a class with `parse` and `__str__` (`linear:5`); another dataclass (a group, `--dataset.root`); or `Open`: a
+dict of a group whose options only another program knows (`--policy.*`). `given(Config)` is a dict of the options of
+`Config` that the user gave; the command makes a `Config` from them.
 """
 
 from __future__ import annotations
@@ -24,12 +23,18 @@ from pathlib import Path
 from typing import Any, Literal, Union
 
 from manip_il.checks import parse_yaml
-from manip_il.option import typed
+from manip_il.option import NameOrPath, typed
 
 Open = dict[str, Any]  # option -> value as read by YAML
 Given = dict[str, Any]  # field -> value
-_NAMED = str | Path  # see `typed`
-_METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", bool: "true|false", str: "TEXT", Path: "PATH", _NAMED: "TEXT"}
+_METAVARS: dict[Any, str] = {
+    int: "INT",
+    float: "FLOAT",
+    bool: "true|false",
+    str: "TEXT",
+    Path: "PATH",
+    NameOrPath: "TEXT",
+}
 
 
 def group(default: Any, prefix: str | None = None) -> Any:
@@ -177,7 +182,7 @@ def metavar(option_type: Any) -> str:
 
 def from_word(option_type: Any, word: str) -> Any:
     """Return the value of a command-line word: None for `null`, texts for a list type, else the word itself."""
-    if (some := without_none(option_type)) is not option_type:
+    if (some := without_none(option_type)) != option_type:
         return None if word.lower() in ("null", "none") else from_word(some, word)
     if typing.get_origin(option_type) is not list:
         return word
@@ -199,7 +204,7 @@ def decode(option_type: Any, value: Any) -> Any:
         return some.parse(value)
     if some == list[Path] and isinstance(value, str):
         value = [value]
-    if some == _NAMED:
+    if some == NameOrPath:
         return typed(_expand(draccus.decode(str, value)))
     decoded: Any = draccus.decode(option_type, value)
     if decoded != decoded or (isinstance(value, bool) and some is not bool) or (some is Path and value == ""):
@@ -216,7 +221,6 @@ def _expand(value: Any) -> Any:
 
 def without_none(option_type: Any) -> Any:
     """Return `X` of `X | None`, and any other type as it is."""
-    members = typing.get_args(option_type)
-    if typing.get_origin(option_type) not in (Union, types.UnionType) or types.NoneType not in members:
+    if typing.get_origin(option_type) not in (Union, types.UnionType):
         return option_type
-    return functools.reduce(operator.or_, (member for member in members if member is not types.NoneType))
+    return functools.reduce(operator.or_, (one for one in typing.get_args(option_type) if one is not types.NoneType))

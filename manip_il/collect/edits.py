@@ -30,9 +30,10 @@ from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
 from manip_il.mdp import Episode, State
+from manip_il.option import NameOrPath
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.variation import OLDER
-from manip_il.tasks.config import EnvConfig, complete
+from manip_il.tasks.config import EnvConfig, stored_config
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 Columns = dict[str, NDArray[Any]]
@@ -60,15 +61,15 @@ class EditSource:
 
 def open_source(
     root: Path,
-    robot: str | Path | None = None,
-    task: str | Path | None = None,
-    shape: str | Path | None = None,
+    robot: NameOrPath | None = None,
+    task: NameOrPath | None = None,
+    shape: NameOrPath | None = None,
 ) -> EditSource:
     """Open a dataset whose states are to be restored.
 
     robot, task, shape: as in `EnvConfig`, for a robot, a task or a mesh of the user's own.
     Raises `ManipError` if the folder is not a dataset of ours, `MismatchError` if it is for another robot, task or
-    object, and what `complete` raises for a robot, task or object that is not built in.
+    object, and what `stored_config` raises for a robot, task or object that is not built in.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
@@ -76,8 +77,7 @@ def open_source(
         raise ManipError(
             f"{root} has no {OURS}, which LeRobot's tools drop: copy it from the dataset that this one was made from"
         )
-    robot, task, shape = robot or spec.robot, task or spec.task, shape or spec.object
-    env = complete(EnvConfig(spec.fps, robot=robot, task=task, object=shape))
+    env = stored_config(spec, robot, task, shape)
     given = env_spec(env)
     for what in ("robot", "task", "object"):
         if getattr(given, what) != getattr(spec, what):

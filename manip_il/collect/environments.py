@@ -51,14 +51,14 @@ def make_env(
 ) -> Environment:
     """Make an environment. Raises `UsageError` for cameras or conditions that it does not support."""
     if config.robot in STOCK:
-        return make_stock(*_stock_names(config), cameras, conditions)
+        return make_stock(config.robot, config.task, cameras, conditions)
     return env_of(config, cameras, conditions)
 
 
 @lru_cache(SCENES_KEPT)
 def make_expert(config: EnvConfig) -> Labeller:
     """Return the expert of an environment, cached."""
-    return make_stock_expert(*_stock_names(config)) if config.robot in STOCK else Expert(config_scene(config))
+    return make_stock_expert(config.robot, config.task) if config.robot in STOCK else Expert(config_scene(config))
 
 
 @cache
@@ -75,7 +75,7 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
             fps=config.control_hz,
             joint_names=robot.joint_names,
             environment_state_names=stock.observed,
-            sim_state_size=len(described_stock(*_stock_names(config)).get_state().to_vector()),
+            sim_state_size=len(described_stock(config.robot, config.task).get_state().to_vector()),
             instruction=stock.instruction,
             action_meaning=robot.action_meaning,
             phases=stock.phases,
@@ -102,7 +102,7 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
 
 def env_actions(config: EnvConfig) -> ActionSpace:
     """Return names, bounds and scale of an environment's actions, (n,)."""
-    return (described_stock(*_stock_names(config)) if config.robot in STOCK else config_scene(config)).actions
+    return (described_stock(config.robot, config.task) if config.robot in STOCK else config_scene(config)).actions
 
 
 def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:
@@ -112,10 +112,6 @@ def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> d
     drawn = DRAWN + (str(config.task).partition(":")[0] in _TURNED)
     look = hashlib.sha256(f"{canonical_json(cameras)} {drawn}".encode()).hexdigest()
     return {**_fingerprint(config), "cameras_sha256": look}
-
-
-def _stock_names(config: EnvConfig) -> tuple[str, str]:
-    return str(config.robot), str(config.task)
 
 
 @cache
@@ -134,5 +130,5 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
         settings["object"], own = stored(config.object), own | ({"object_sha256": mesh.sha256} if mesh else {})
     if not config.object:  # as in fingerprints of versions that had no `object`
         del settings["object"]
-    made = described_stock(*_stock_names(config)) if config.robot in STOCK else config_scene(config)
+    made = described_stock(config.robot, config.task) if config.robot in STOCK else config_scene(config)
     return environment_fingerprint(model_bytes(made.model), settings) | own

@@ -17,6 +17,7 @@ from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.results import FILE_NAME, EvalResult, require_equal
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
 from manip_il.evaluation.runner import FOLDER, Progress, Trial
+from manip_il.option import NameOrPath
 from manip_il.sim.conditions import Condition
 from manip_il.tasks.config import EnvConfig
 
@@ -66,7 +67,7 @@ class Member:
         return replace(self, result=result)
 
     def env(
-        self, robot: str | Path | None = None, task: str | Path | None = None, shape: str | Path | None = None
+        self, robot: NameOrPath | None = None, task: NameOrPath | None = None, shape: NameOrPath | None = None
     ) -> EnvConfig:
         """Return the environment in which the member's run was validated.
 

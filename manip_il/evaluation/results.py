@@ -14,6 +14,7 @@ from manip_il import checks
 from manip_il.data.atomic import write_json
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
+from manip_il.option import NameOrPath
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.shape import stored
 from manip_il.tasks.config import EnvConfig, complete
@@ -67,10 +68,7 @@ class EpisodeResult:
 
         Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or invalid.
         """
-        known = {"success_at_end": data["success"], "phase_at_end": ""} | {
-            key: data[key] for key in data if key in _KEYS
-        }
-        values: list[Any] = [convert(known[key]) for key, convert in _KEYS.items()]
+        values: list[Any] = [convert(data[key]) for key, convert in _KEYS.items()]
         for name in ("drawn", "start", "end"):
             checks.mapping(name, data.get(name, {}))
         for number in chain(*data.get("start", {}).values(), [data.get("steps_to_success") or 0]):
@@ -97,9 +95,8 @@ class EvalSettings:
     object: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("horizon", "control_hz", "success_steps", "hold"):
-            if name != "hold" or self.hold is not None:
-                checks.whole(name, getattr(self, name), 0, _MOST)
+        for steps in (self.horizon, self.success_steps, self.control_hz, 0 if self.hold is None else self.hold):
+            checks.whole("horizon, success_steps, control_hz or hold", steps, 0, _MOST)
         checks.number("tolerance", self.tolerance)
         checks.text("suite", self.suite)
         checks.object_name(self.object)
@@ -111,7 +108,7 @@ class EvalSettings:
         steps, hz = env.success_steps, env.control_hz
         return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, stored(env.object))
 
-    def env(self, robot: str | Path, task: str | Path, shape: str | Path | None = None) -> EnvConfig:
+    def env(self, robot: NameOrPath, task: NameOrPath, shape: NameOrPath | None = None) -> EnvConfig:
         """Return the environment of the evaluation. shape: the object, if it is a mesh, as in `EnvConfig`."""
         limits = self.tolerance, self.success_steps, self.horizon
         return complete(EnvConfig(self.control_hz, *limits, robot, task, shape or self.object))
@@ -221,16 +218,16 @@ class EvalResult:
 
         Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or invalid.
         """
-        settings, width = checks.mapping("settings", data["settings"]), data.get("until_width")
+        width = data["until_width"]
         return cls(
             policy=checks.text("policy", data["policy"]),
-            # Older files store the path of a user's own robot, named like its file, and the reward in the settings.
+            # Older files store the path of a user's own robot, which is named like its file.
             robot=checks.name("robot", PurePath(checks.text("robot", data["robot"])).stem),
-            task=checks.task_name(":".join(filter(None, (data["task"], settings.get("reward"))))),
+            task=checks.task_name(data["task"]),
             fingerprint=checks.mapping("fingerprint", data["fingerprint"]),
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),
-            settings=EvalSettings.from_json(settings),
-            policy_sha256=checks.text("policy_sha256", data.get("policy_sha256", "")),
+            settings=EvalSettings.from_json(checks.mapping("settings", data["settings"])),
+            policy_sha256=checks.text("policy_sha256", data["policy_sha256"]),
             until_width=None if width is None else checks.number("until_width", width),
         )
 

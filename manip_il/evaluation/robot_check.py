@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -21,6 +20,7 @@ from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
 from manip_il.evaluation.tables import CLONING, EXPERT, Table
+from manip_il.option import NameOrPath
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
@@ -76,7 +76,7 @@ class RobotCheck:
     while it points down.
     """
 
-    name: str | Path
+    name: NameOrPath
     robot: Robot
     opening: float
     table: float
@@ -99,7 +99,7 @@ class RobotCheck:
 
 
 def check_robot(
-    name: str | Path,
+    name: NameOrPath,
     tasks: Sequence[str],
     episodes: int,
     engine: Engine,
@@ -123,7 +123,7 @@ def check_robot(
     return RobotCheck(name, robot, scene.gripper.most, table, tuple(checked))
 
 
-def check_starts(name: str | Path, task: str) -> TaskCheck:
+def check_starts(name: NameOrPath, task: str) -> TaskCheck:
     """Draw up to `STARTS` starts of a task with a robot, as episodes do; stop at one without a valid placement."""
     the_task, starts = get_task(task), 0
     try:
@@ -228,7 +228,7 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def looks(name: str | Path) -> tuple[Film, ...]:
+def looks(name: NameOrPath) -> tuple[Film, ...]:
     """Return pictures of a robot in its home pose, with the axes of its frame `ee`.
 
     Raises `RenderError` without off-screen OpenGL.

@@ -145,7 +145,7 @@ def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
     """
     state = State.from_vector(sim_state)
     if env.robot in STOCK:
-        stock = described_stock(str(env.robot), str(env.task))
+        stock = described_stock(env.robot, env.task)
         stock.set_state(state)
         found = stock.positions
     else:

@@ -17,7 +17,7 @@ from lerobot.envs import EnvConfig
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import UnknownName, UsageError, silence_ffmpeg_warning
 from manip_il.learn.names import OBSERVATIONS
-from manip_il.option import option_of, typed
+from manip_il.option import NameOrPath, option_of, typed
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import CAMERAS, CameraConfig
 from manip_il.sim.env import ManipEnv, environment_state_names
@@ -139,7 +139,7 @@ class ManipILEnv(EnvConfig):
         return features
 
 
-def _given(text: str | Path) -> str | Path:
+def _given(text: NameOrPath) -> NameOrPath:
     """Return `typed(text)` if the command line has it: LeRobot also reads options from files in checkpoints."""
     return typed(text) if any(f"={word}".endswith(f"={text}") for word in sys.argv) else text
 

@@ -13,6 +13,7 @@ from typing import Any
 from manip_il import checks
 from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.option import NameOrPath
 from manip_il.robots import ROBOTS
 from manip_il.robots.files import KEYS, ModelFiles, read
 from manip_il.robots.robot import FOUND, GRIPPER, SOFT, UPRIGHT, YAWS, CameraPose, Costs, GripperConfig, Robot
@@ -23,7 +24,7 @@ _UPRIGHT_JOINTS = 6  # with fewer joints, a hand cannot point down everywhere
 GROUP = "manip_il.robots"  # entry points: a robot's name, and the path of its YAML
 
 
-def get_robot(name: str | Path) -> Robot:
+def get_robot(name: NameOrPath) -> Robot:
     """Return a robot by its name or its entry point, or from the YAML at a `Path` that the user gave.
 
     Raises `UnknownName`, `UsageError`.

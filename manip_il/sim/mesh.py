@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.errors import UsageError, shorten
-from manip_il.sim.shape import stored_mesh
+from manip_il.option import NameOrPath
 
-_TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj)(?P<hash>#[0-9a-f]{12})?)(?P<length>:\d*\.?\d+)?", re.DOTALL)
+_TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj))(?P<length>:\d*\.?\d+)?", re.DOTALL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +48,10 @@ def parse_mesh(shape: Path) -> Mesh:
     text = str(shape)
     if (found := _TEXT.fullmatch(text)) is None:
         raise UsageError(f"object is {shorten(text)}; expected mesh:FILE or mesh:FILE:LENGTH [m], FILE an STL or OBJ")
-    if found["hash"]:
-        raise stored_mesh(text)
     return _read(Path(found["path"]), float((found["length"] or ":0")[1:]))
 
 
-def mesh_path(shape: str | Path) -> Path | None:
+def mesh_path(shape: NameOrPath) -> Path | None:
     """Return the path in an object's text, as in `parse_mesh`; None for an object without a file."""
     found = _TEXT.fullmatch(str(shape)) if isinstance(shape, Path) else None
     return Path(found["path"]) if found else None

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manip_il.errors import UnknownName, UsageError, shorten
+from manip_il.option import NameOrPath
 
 if TYPE_CHECKING:
     from manip_il.sim.mesh import Mesh
@@ -66,7 +67,7 @@ class Shape:
             )
 
     @classmethod
-    def parse(cls, text: str | Path) -> Shape:
+    def parse(cls, text: NameOrPath) -> Shape:
         """Return the shape that a text describes, or a mesh, which only a `Path` can name (see `option.typed`).
 
         Raises `UnknownName` or `UsageError`.
@@ -78,7 +79,8 @@ class Shape:
             return cls(MESH, mesh.lengths, mesh)
         kind, colon, size = text.partition(":")
         if kind == MESH:
-            raise stored_mesh(text)
+            give = re.sub(r"^mesh:(?:.*/)?([^#]*)(#[0-9a-f]*)?", r"mesh:PATH/\1", text)
+            raise UsageError(f"object {text}: only the name of the mesh was stored; give --task.object={give}")
         if kind not in _SIZES:
             raise UnknownName("shape", kind, (*_SIZES, "mesh:FILE"))
         try:
@@ -156,20 +158,14 @@ def _lengths(kind: str, first: float, second: float | None = None, *rest: float)
     return first, first, longer if second is None else second
 
 
-def draws_shape(text: str | Path) -> bool:
+def draws_shape(text: NameOrPath) -> bool:
     """Return whether `text`, as in `Shape.parse`, asks for a shape that is drawn anew in each episode."""
     return str(text).partition(":")[0] == ANY
 
 
-def stored(text: str | Path) -> str:
+def stored(text: NameOrPath) -> str:
     """Return an object's text as datasets store it: for a mesh, with the file's name and hash in place of its path."""
     return str(Shape.parse(text)) if isinstance(text, Path) else text
-
-
-def stored_mesh(text: str) -> UsageError:
-    """Return the error for a mesh of which only the name is known, as in datasets."""
-    give = re.sub(rf"^{MESH}:(?:.*/)?([^#]*)(?:#[0-9a-f]{{12}})?", rf"{MESH}:PATH/\1", text)
-    return UsageError(f"object {text}: only the name of the mesh was stored; give --task.object={give}")
 
 
 ROLLING = 0.005  # rolling friction of round objects, as on a cloth: dropped ones stay within reach [m]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import mujoco
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UsageError, shorten
+from manip_il.option import NameOrPath
 from manip_il.robots.robot import Robot
 from manip_il.sim.shape import Shape
 from manip_il.sim.world import World
@@ -170,7 +170,7 @@ class TakesShape(Protocol):
 class TakesArgument(Protocol):
     """A task with variants, called `NAME:ARGUMENT`; the state holds an episode's variant."""
 
-    def with_argument(self, text: str | Path) -> Task:
+    def with_argument(self, text: NameOrPath) -> Task:
         """Return the variant that a text or a file describes; its name is `NAME` or `NAME:A=NUMBER,B=NUMBER`."""
         ...
 

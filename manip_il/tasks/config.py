@@ -8,7 +8,7 @@ from typing import Any
 
 from manip_il.checks import check_unchanged
 from manip_il.errors import UnknownName, UsageError
-from manip_il.option import option, typed
+from manip_il.option import NameOrPath, option, typed
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import MOST_HZ, Episodes
 from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
@@ -35,9 +35,9 @@ class EnvConfig(Episodes):
     takes for a path.
     """
 
-    robot: str | Path = option("panda", ROBOT_HELP, flag="robot.type")
-    task: str | Path = option("pick_place", TASK_HELP, flag="task.type")
-    object: str | Path = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
+    robot: NameOrPath = option("panda", ROBOT_HELP, flag="robot.type")
+    task: NameOrPath = option("pick_place", TASK_HELP, flag="task.type")
+    object: NameOrPath = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
 
     @property
     def name(self) -> str:
@@ -46,8 +46,8 @@ class EnvConfig(Episodes):
 
 
 def make_config(
-    robot: str | Path = EnvConfig.robot,
-    task: str | Path = EnvConfig.task,
+    robot: NameOrPath = EnvConfig.robot,
+    task: NameOrPath = EnvConfig.task,
     control_hz: int = 0,
     **settings: Any,
 ) -> EnvConfig:
@@ -70,12 +70,22 @@ def make_config(
     return complete(EnvConfig(control_hz, **settings))
 
 
-def stored_config(spec: Any) -> EnvConfig:
-    """Return the settings of the environment that a dataset or a policy names, of which no file is opened.
+def stored_config(
+    spec: Any, robot: NameOrPath | None = None, task: NameOrPath | None = None, shape: NameOrPath | None = None
+) -> EnvConfig:
+    """Return the settings of the environment that a dataset or a policy names; what it names is never a path.
 
-    spec: a `RobotTaskSpec` or an `Origin`. Raises what `make_config` raises if the environment is not built in.
+    Args:
+        spec: A `RobotTaskSpec` or an `Origin`.
+        robot: What the user gave, which replaces the name in `spec`; the same for the task.
+        task: See `robot`.
+        shape: See `robot`; the object.
+
+    Raises:
+        UsageError: if something that is not built in was not given, and whatever else `make_config` raises.
     """
-    return complete(EnvConfig(spec.fps, robot=spec.robot, task=spec.task, object=spec.object))
+    named = {"robot": robot or spec.robot, "task": task or spec.task, "object": shape or spec.object}
+    return complete(replace(EnvConfig(spec.fps), **named))
 
 
 def complete(config: EnvConfig) -> EnvConfig:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
+from manip_il.option import NameOrPath
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.sim.conditions import Condition
@@ -17,7 +17,7 @@ from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.table import get_task
 
 
-def scene_of(robot: str | Path, task: str | Path, shape: str | Path = "") -> Scene:
+def scene_of(robot: NameOrPath, task: NameOrPath, shape: NameOrPath = "") -> Scene:
     """Return the compiled scene of a robot, a task and an object, as in `EnvConfig`.
 
     Raises `UnknownName`, `UsageError`.
@@ -36,8 +36,8 @@ def env_of(config: EnvConfig, cameras: CameraConfig | None = None, conditions: S
 
 
 def make_env(
-    robot: str | Path = EnvConfig.robot,
-    task: str | Path = EnvConfig.task,
+    robot: NameOrPath = EnvConfig.robot,
+    task: NameOrPath = EnvConfig.task,
     *,
     cameras: Sequence[str] = (),
     image_size: tuple[int, int] = (128, 128),

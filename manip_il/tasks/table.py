@@ -17,6 +17,7 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.errors import OWN, UnknownName, UsageError
+from manip_il.option import NameOrPath
 from manip_il.sim.shape import Shape
 from manip_il.sim.task import TakesArgument, TakesShape, Task
 from manip_il.tasks.carry.task import Carry
@@ -52,7 +53,7 @@ TASKS: dict[str, Task] = {
 }
 
 
-def get_task(name: str | Path, shape: str | Path = "") -> Task:
+def get_task(name: NameOrPath, shape: NameOrPath = "") -> Task:
     """Return a task by its name, `NAME` or `NAME:ARGUMENT`, or from a file of the user's own.
 
     Args:
@@ -84,7 +85,7 @@ def get_task(name: str | Path, shape: str | Path = "") -> Task:
 
 
 @cache  # the same text gives the same task, so that its scene is built once
-def _shaped(task: TakesShape, shape: str | Path) -> Task:
+def _shaped(task: TakesShape, shape: NameOrPath) -> Task:
     return task.with_shape(Shape.parse(shape))
 
 

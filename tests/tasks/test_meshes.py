@@ -23,7 +23,7 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.sim.rests import LEAST_ROOM
 from manip_il.sim.shape import DENSITY, LIGHTEST, Shape
 from manip_il.sim.world import World
-from manip_il.tasks.config import make_config
+from manip_il.tasks.config import make_config, stored_config
 from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.grasp import lie_of
 from tests.meshes import MESHES, write_mesh
@@ -126,7 +126,7 @@ def test_data_have_its_name_and_hash_and_no_path(folder, tmp_path):
     assert env_fingerprint(make_config("panda", object=f"mesh:{moved}:0.06")) == before
     assert not is_known("panda", "pick_place", spec.object)
     with pytest.raises(UsageError, match=r"name of the mesh was stored; give --task\.object=mesh:PATH/mug\.obj:0\.06"):
-        make_config("panda", object=spec.object)
+        stored_config(spec)
 
 
 def test_a_dataset_and_an_evaluation_of_it_are_used_with_its_file(folder, tmp_path, monkeypatch, capsys):
@@ -173,15 +173,23 @@ MISTAKES = {
         "own.stl",
         "m wide, and the gripper of panda opens",
     ),
+    "is too low as it rests": (
+        trimesh.creation.box((0.06, 0.05, 0.008)).export,
+        "own.stl",
+        "rests 0.008 m high (0.012 m is the least",
+    ),
+    "has no triangles": (lambda path: path.write_text("o nothing\n"), "own.obj", "own.obj is empty"),
+    "has no bytes": (lambda path: path.write_bytes(b""), "own.stl", "own.stl is empty"),
     "is in millimetres": (trimesh.creation.box((50, 40, 30)).export, "own.stl", "is 50 m long; expected 0.02 to 0.2 m"),
 }
 
 
+@pytest.mark.parametrize("command", [["eval", "--policy.type=expert", "--output_dir=out"], ["record"]])
 @pytest.mark.parametrize("case", MISTAKES)
-def test_a_mesh_that_cannot_be_used_is_one_line(case, tmp_path, capsys):
+def test_a_mesh_that_cannot_be_used_is_one_line(case, command, tmp_path, monkeypatch, capsys):
     write, name, says = MISTAKES[case]
+    monkeypatch.chdir(tmp_path)
     write(tmp_path / name)
-    mesh = f"--task.object=mesh:{tmp_path / name}"
-    assert main(["eval", "--policy.type=expert", mesh, f"--output_dir={tmp_path / 'e'}"]) == 2
+    assert main([*command, f"--task.object=mesh:{tmp_path / name}"]) == 2
     error = capsys.readouterr().err
     assert (error.count("\n"), says in error) == (1, True), error

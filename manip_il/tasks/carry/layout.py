@@ -19,6 +19,7 @@ import numpy as np
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError, shorten
 from manip_il.mdp import F64
+from manip_il.option import NameOrPath
 
 FEATURES = (
     "length",  # 1
@@ -177,7 +178,7 @@ class Reward:
         return cls(tuple(weights.get(name, 0.0) for name in FEATURES))
 
     @classmethod
-    def parse(cls, text: str | Path) -> Reward:
+    def parse(cls, text: NameOrPath) -> Reward:
         """Return the reward that a text describes: the name of a shipped one, or `NAME=NUMBER,...`.
 
         A `Path` is a `reward.json`, whose lists `names` and `weights` are read. Raises `UsageError` for anything else.

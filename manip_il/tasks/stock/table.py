@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
+from manip_il.option import NameOrPath
 from manip_il.sim.config import OTHERS
 
 ROBOT = "fetch_stock"
@@ -143,7 +143,7 @@ class StockRobot:
     ends_solved: bool = field(default=False, kw_only=True)
 
 
-ROBOTS: dict[str | Path, StockRobot] = {
+ROBOTS: dict[NameOrPath, StockRobot] = {
     ROBOT: StockRobot(
         STOCK,
         STATE_NAMES,
