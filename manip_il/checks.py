@@ -68,6 +68,13 @@ def task_name(value: object) -> str:
     return f"{base}{colon}{numbers}"
 
 
+def object_name(value: object) -> str:
+    """Return an object's text as it is stored: a shape, or a mesh by the name of its file, never by a path."""
+    if "/" in text("object", value, LONGEST_NAME):
+        raise ManipError(f"object is {shorten(value)}; expected a shape, or a mesh's name without a path")
+    return text("object", value)
+
+
 def repo_id(what: str, value: object) -> str:
     """Return the id of a dataset or policy, `NAME` or `USER/NAME`, both parts checked as by `name`."""
     user, slash, rest = text(what, value).partition("/")

@@ -10,9 +10,23 @@ import types
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 from manip_il.errors import UnknownName, UsageError, shorten
+
+NameOrPath = str | Path  # of a robot, a task or an object: only a `Path` is ever opened, see `typed`
+_FILES = (".py", ".yaml", ".yml", ".json")  # suffixes of files with a user's own task, robot or reward
+
+
+def typed(text: NameOrPath) -> NameOrPath:
+    """Return a robot, a task or an object that a person typed: a `Path` if it names a file, else the name itself.
+
+    Only a `Path` is ever opened. What a dataset, a checkpoint or a result names is a `str`, which is looked up among
+    the known names alone, so it must never be passed to this function.
+    """
+    said = str(text)
+    return Path(said) if said.startswith("mesh:") or said.endswith(_FILES) else text
 
 
 def option(default: Any, help_text: str, **metadata: Any) -> Any:

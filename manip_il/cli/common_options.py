@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -11,7 +11,8 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.option import option
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
-from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.sim.shape import MESH
+from manip_il.tasks.config import EnvConfig, complete
 from manip_il.tasks.stock import table as stock
 
 if TYPE_CHECKING:
@@ -43,11 +44,14 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
         values = of_policy | values
         if values.get("task") == origin.task:
             values.setdefault("object", origin.object)
-    return make_config(**values)
+    return complete(EnvConfig(**values))
 
 
-def own_files(robot: str, task: str) -> list[str]:
-    """Return the options, with FILE for a path, that commands need for a robot or a task that is not built in."""
+def own_files(robot: str, task: str, shape: str = "") -> list[str]:
+    """Return the options, with FILE for a path, that commands need for what a dataset or a policy only names.
+
+    robot, task, shape: as in a `RobotTaskSpec`.
+    """
     from manip_il.data.dataset import UNKNOWN_TASK
     from manip_il.robots.table import is_robot
     from manip_il.tasks.table import is_task
@@ -55,23 +59,24 @@ def own_files(robot: str, task: str) -> list[str]:
     if robot in stock.ROBOTS or task == UNKNOWN_TASK:
         return []
     robots = [] if is_robot(robot) else ["--robot.type=FILE.yaml"]
-    return robots + ([] if is_task(task) else ["--task.type=FILE.py"])
-
-
-_FILES = (".py", ".yaml", ".yml")  # suffixes of files with a user's own task or robot
+    meshes = ["--task.object=mesh:FILE:LENGTH"] if shape.startswith(MESH) else []
+    return [*robots, *([] if is_task(task) else ["--task.type=FILE.py"]), *meshes]
 
 
 def env_options(env: EnvConfig) -> list[str]:
     """Return those options of an environment that no dataset or policy stores: paths, and changed limits."""
-    named = {"robot": env.robot, "task": env.task}
     try:
-        usual = make_config(env.robot, env.task, env.control_hz, object=env.object)
+        usual = complete(replace(env, tolerance=0.0, horizon=0, success_steps=0))
     except ManipError:  # the user's file was edited or deleted meanwhile
         usual = env
     limits = [name for name in ("tolerance", "horizon", "success_steps") if getattr(env, name) != getattr(usual, name)]
-    paths = [f"--{what}.type={name}" for what, name in named.items() if name.endswith(_FILES)]
-    paths += [f"--task.object={env.object}"] if env.object.startswith("mesh:") else []
-    return paths + [f"--env.{name}={getattr(env, name):g}" for name in limits]
+    return path_options(env) + [f"--env.{name}={getattr(env, name):g}" for name in limits]
+
+
+def path_options(env: EnvConfig) -> list[str]:
+    """Return the options that name files of the user's own, which no dataset, policy or result stores."""
+    named = {"--robot.type": env.robot, "--task.type": env.task, "--task.object": env.object}
+    return [f"{name}={path}" for name, path in named.items() if isinstance(path, Path)]
 
 
 def default_cameras(env: EnvConfig) -> tuple[str, ...]:

@@ -162,7 +162,7 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
         given = {name: value for name, value in self.env.items() if value is not None}
         members = [member for arm in arms for member in arm.members]
         if runs := [member for member in members if member.history]:
-            own = given.pop("task", None), given.pop("object", None)
+            own = [given.pop(name, None) for name in ("robot", "task", "object")]
             return require_same_env({run.name: replace(run.env(*own), **given) for run in runs})
         origins = {one.name: Checkpoint.open(one.policy).origin for one in members if one.policy is not None}
         return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})

@@ -16,7 +16,7 @@ from manip_il.cli.progress import progress, say, warn
 from manip_il.data.atomic import exclusive
 from manip_il.data.ownership import DATASET
 from manip_il.evaluation.suites import varied
-from manip_il.option import Seeded, option
+from manip_il.option import NameOrPath, Seeded, option
 from manip_il.sim.config import CameraConfig, Look
 
 if TYPE_CHECKING:
@@ -98,9 +98,9 @@ class Edit(Replacing):
     target: Path | None = option(
         None, "folder of the new dataset; by default SOURCE_rendered, _relabelled or _redrawn", positional=True
     )
-    robot: str | None = option(None, "YAML file of the dataset's robot, if it is your own", flag="robot.type")
-    task: str | None = option(None, "Python file of the dataset's task, if it is your own", flag="task.type")
-    object: str | None = option(
+    robot: NameOrPath | None = option(None, "YAML file of the dataset's robot, if it is your own", flag="robot.type")
+    task: NameOrPath | None = option(None, "Python file of the dataset's task, if it is your own", flag="task.type")
+    object: NameOrPath | None = option(
         None, "mesh:FILE:LENGTH as in the recording, if the dataset's object is a mesh", flag="task.object"
     )
     workers: int | None = option(None, "number of processes; by default one per core", at_least=1)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting
+from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting, path_options
 from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import ResumableOutput, publish
 from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.data.atomic import write_file
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, UsageError, shorten
 from manip_il.option import Seeded, option
 from manip_il.tasks.config import EnvConfig
 
@@ -113,8 +113,8 @@ class EvalOptions(Tested, Seeded, Trusting):
                 films = film_outcomes(engine, job, result, self.eval.films, stages)
             self._report(result, folder, *films)
         seed = next((one.seed for one in result.episodes if not one.success), result.episodes[0].seed)
-        own = [f"--task.type={job.env.task}"] if job.env.task.endswith(".py") else []
-        say_next("eval", folder, *own, f"--replay={seed}", "--video=replay.mp4")
+        policy = [] if self.policy.path is None else [f"--policy.path={self.policy.path}"]
+        say_next("eval", folder, *policy, *path_options(job.env), f"--replay={seed}", "--video=replay.mp4")
 
     def _job(self) -> RolloutJob:
         from manip_il.cli.inputs import open_driver
@@ -177,20 +177,21 @@ class EvalOptions(Tested, Seeded, Trusting):
     def _job_of(self, result: EvalResult, file: Path) -> RolloutJob:
         """Return the rollout job of an evaluation; warn if the policy or this program has changed since.
 
-        A user's own task and mesh must be given again with `--task.type` and `--task.object`.
+        The policy, and a robot, a task or a mesh of the user's own, must be given again: no path in the file is opened.
         """
         from manip_il.cli.inputs import open_driver
         from manip_il.collect.environments import env_fingerprint, env_spec
         from manip_il.collect.job import RolloutJob
         from manip_il.data.fingerprint import compare_fingerprints, policy_sha256
         from manip_il.evaluation.policy_folder import find_policy
+        from manip_il.evaluation.results import require_equal
 
-        settings = replace(result.settings, object=self.env["object"] or result.settings.object)
-        env = settings.env(result.robot, self.env["task"] or result.task)
-        if (given := env_spec(env).task) != result.task:
-            raise MismatchError("task", str(file), result.task, "--task.type", given)
-        is_policy = result.policy not in NO_FILES or self.policy.path is not None
-        path = find_policy(self.policy.path or Path(result.policy)) if is_policy else None
+        settings, own = result.settings, self.env
+        env = settings.env(own["robot"] or result.robot, own["task"] or result.task, own["object"])
+        require_equal(str(file), result, "what is given", env_spec(env), "robot", "task")
+        if self.policy.path is None and result.policy not in NO_FILES:
+            raise UsageError(f"{file} evaluates the policy {shorten(result.policy)}; give that with --policy.path=DIR")
+        path = None if self.policy.path is None else find_policy(self.policy.path)
         _, driver, cameras = open_driver(path, result.policy, env, trust=self.trust)
         if path is not None and result.policy_sha256 not in ("", policy_sha256(path)):
             warn(f"{path} is not the policy of {file}: its files differ")

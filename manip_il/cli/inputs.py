@@ -23,7 +23,7 @@ from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.sources import check_same_sources
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.config import EnvConfig, stored_config
 
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 
@@ -85,7 +85,7 @@ def differences(dataset: Dataset) -> list[str]:
     spec, name = dataset.spec, str(dataset.root)
     if not is_known(spec.robot, spec.task, spec.object):
         return []
-    env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
+    env = stored_config(spec)
     check_same_spec(name, spec, "this program", env_spec(env))
     # Tolerance and horizon do not affect learning, and a dataset does not hold them; pictures are not compared.
     here = {key: value for key, value in env_fingerprint(env).items() if key not in _NOT_COMPARED}

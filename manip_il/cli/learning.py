@@ -15,7 +15,7 @@ from manip_il.data.json_lines import read_lines
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.option import option
-from manip_il.tasks.config import make_config
+from manip_il.tasks.config import stored_config
 
 if TYPE_CHECKING:
     from manip_il.data.schema import RobotTaskSpec
@@ -63,7 +63,7 @@ class Learning:
 
     def _config(self, spec: RobotTaskSpec | Origin, **more: Any) -> LearningConfig:
         """Return the configuration for the environment of `spec`; `UnknownName` if that is not built in."""
-        env = make_config(spec.robot, spec.task, spec.fps, object=spec.object)
+        env = stored_config(spec)
         start = None if self.init is None else find_policy(self.init)
         return LearningConfig(method=self.method, env=env, ppo=self.ppo, start=start, **more, **self.settings)
 

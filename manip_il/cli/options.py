@@ -1,9 +1,9 @@
 """Options of commands: the fields of their dataclasses, the values that a type accepts, and their names in help.
 
-A field's type is int, float, bool, str, Path or a `Literal` of names; one of these or None; a list of one of these; a
-class with `parse` and `__str__` (`linear:5`); another dataclass (a group, `--dataset.root`); or `Open`: a dict of a
-group whose options only another program knows (`--policy.*`). `given(Config)` is a dict of the options of `Config` that
-the user gave; the command makes a `Config` from them.
+A field's type is int, float, bool, str, Path, `NameOrPath` or a `Literal` of names; one of these or None; a list of one
+of these; a class with `parse` and `__str__` (`linear:5`); another dataclass (a group, `--dataset.root`); or `Open`: a
+dict of a group whose options only another program knows (`--policy.*`). `given(Config)` is a dict of the options of
+`Config` that the user gave; the command makes a `Config` from them.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import operator
 import re
 import shlex
 import sys
@@ -22,11 +23,18 @@ from pathlib import Path
 from typing import Any, Literal, Union
 
 from manip_il.checks import parse_yaml
-from manip_il.option import type_of
+from manip_il.option import NameOrPath, type_of, typed
 
 Open = dict[str, Any]  # option -> value as read by YAML
 Given = dict[str, Any]  # field -> value
-_METAVARS = {int: "INT", float: "FLOAT", bool: "true|false", str: "TEXT", Path: "PATH"}
+_METAVARS: dict[Any, str] = {
+    int: "INT",
+    float: "FLOAT",
+    bool: "true|false",
+    str: "TEXT",
+    Path: "PATH",
+    NameOrPath: "TEXT",
+}
 
 
 def group(default: Any, prefix: str | None = None) -> Any:
@@ -168,7 +176,7 @@ def metavar(option_type: Any) -> str:
 
 def from_word(option_type: Any, word: str) -> Any:
     """Return the value of a command-line word: None for `null`, texts for a list type, else the word itself."""
-    if (some := without_none(option_type)) is not option_type:
+    if (some := without_none(option_type)) != option_type:
         return None if word.lower() in ("null", "none") else from_word(some, word)
     if typing.get_origin(option_type) is not list:
         return word
@@ -190,6 +198,8 @@ def decode(option_type: Any, value: Any) -> Any:
         return some.parse(value)
     if some == list[Path] and isinstance(value, str):
         value = [value]
+    if some == NameOrPath:
+        return typed(_expand(draccus.decode(str, value)))
     decoded: Any = draccus.decode(option_type, value)
     if decoded != decoded or (isinstance(value, bool) and some is not bool) or (some is Path and value == ""):
         raise ValueError
@@ -207,4 +217,4 @@ def without_none(option_type: Any) -> Any:
     """Return `X` of `X | None`, and any other type as it is."""
     if typing.get_origin(option_type) not in (Union, types.UnionType):
         return option_type
-    return next(member for member in typing.get_args(option_type) if member is not types.NoneType)
+    return functools.reduce(operator.or_, (one for one in typing.get_args(option_type) if one is not types.NoneType))

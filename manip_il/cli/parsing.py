@@ -82,7 +82,7 @@ def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: dict[
         if option.is_open:
             held = values.setdefault(option.path, dict(option.default))
             held[name.removeprefix(f"{option.name}.")] = _decode(one)
-        elif one.value is not None or without_none(option.type) is not option.type:  # other nulls mean the default
+        elif one.value is not None or without_none(option.type) != option.type:  # other nulls mean the default
             values[option.path] = _decode(one)
     for option in known.values():
         if option.default is MISSING and option.path not in values:

@@ -76,7 +76,8 @@ class RecordOptions(Varied, Seeded, Resumable):
                 prepare_output(folder, kind, resume=self.resume, overwrite=self.overwrite)
             self._record(job, root, journals, repo_id)
         say_next("train", f"--dataset.root={root}", f"--output_dir=runs/{root.name}")
-        say_next("view", f"--robot.type={env.robot}", f"--task.type={env.task}", what="to watch the expert")
+        shape = [f"--task.object={env.object}"] if env.object else []
+        say_next("view", f"--robot.type={env.robot}", f"--task.type={env.task}", *shape, what="to watch the expert")
 
     def _record(self, job: RolloutJob, root: Path, journals: Path, repo_id: str) -> None:
         from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance

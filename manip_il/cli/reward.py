@@ -100,7 +100,7 @@ class AskOptions(OfPairs):
         self.file.check()
         clips = read_clips(Pairs.read(self.pairs))
         with progress(len(clips.pairs), "render") as bar:
-            films = render_films(clips, str(self.robot) if self.robot else None, bar.step)
+            films = render_films(clips, self.robot, bar.step)
         page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
         write_file(self.file.output, page.encode())
         say(f"{len(clips.pairs):,} pairs: {self.file.output}")

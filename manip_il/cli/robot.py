@@ -14,7 +14,7 @@ from manip_il.cli.outputs import Output, OutputFile, Replacing, publish
 from manip_il.cli.progress import progress, say, say_next
 from manip_il.data.atomic import write_file, write_json
 from manip_il.errors import ManipError, RenderError
-from manip_il.option import Seeded, option
+from manip_il.option import NameOrPath, Seeded, option
 from manip_il.tasks import NAMES
 from manip_il.tasks.config import EnvConfig
 
@@ -49,7 +49,7 @@ class RobotNewOptions(Replacing):
         write_file(target, yaml_of(found, *paths).encode())
         say(f"robot: {target}")
         with Engine(None) as engine:
-            checked = check_robot(str(target), list(NAMES), 0, engine, lambda _: None)
+            checked = check_robot(target, list(NAMES), 0, engine, lambda _: None)
         say(verdict(checked), *(f"change: {line}" for line in advice(checked)))
         if len(checked.failed) == len(NAMES):
             raise ManipError(f"{target} cannot do any task yet; see above")
@@ -65,7 +65,7 @@ class RobotCheckOptions:
     """
 
     example: ClassVar[str] = "manip-il robot check my_arm.yaml --tasks=reach,pick_place --output_dir=runs/my_arm"
-    robot: str = option(MISSING, "the robot's YAML file, or the name of a built-in robot", positional=True)
+    robot: NameOrPath = option(MISSING, "the robot's YAML file, or the name of a built-in robot", positional=True)
     tasks: list[str] = option(list, f"any of {', '.join(NAMES)}; by default all")
     episodes: int = option(
         50,

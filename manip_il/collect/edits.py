@@ -31,8 +31,9 @@ from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
 from manip_il.mdp import Episode, State
+from manip_il.option import NameOrPath
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.tasks.config import EnvConfig, stored_config
 from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 Columns = dict[str, NDArray[Any]]
@@ -58,12 +59,17 @@ class EditSource:
             raise ManipError(f"the labels in {self.dataset.root} hold the sag of serve's servos; {what} would drop it")
 
 
-def open_source(root: Path, robot: str | None = None, task: str | None = None, shape: str | None = None) -> EditSource:
+def open_source(
+    root: Path,
+    robot: NameOrPath | None = None,
+    task: NameOrPath | None = None,
+    shape: NameOrPath | None = None,
+) -> EditSource:
     """Open a dataset whose states are to be restored.
 
-    robot, task: files of the user's own robot and task. shape: as in `EnvConfig.object`, if the object is a mesh.
+    robot, task, shape: as in `EnvConfig`, for a robot, a task or a mesh of the user's own.
     Raises `ManipError` if the folder is not a dataset of ours, `MismatchError` if it is for another robot, task or
-    object, and what `make_config` raises for a robot, task or object that is not built in.
+    object, and what `stored_config` raises for a robot, task or object that is not built in.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
@@ -71,7 +77,7 @@ def open_source(root: Path, robot: str | None = None, task: str | None = None, s
         raise ManipError(
             f"{root} has no {OURS}, which LeRobot's tools drop: copy it from the dataset that this one was made from"
         )
-    env = make_config(robot or spec.robot, task or spec.task, spec.fps, object=shape or spec.object)
+    env = stored_config(spec, robot, task, shape)
     given = env_spec(env)
     for what in ("robot", "task", "object", "sim_state_size"):
         if getattr(given, what) != getattr(spec, what):

@@ -26,11 +26,10 @@ from manip_il.robots.table import get_robot, is_robot
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import environment_state_names
-from manip_il.sim.mesh import is_stored
 from manip_il.sim.points import point_names
 from manip_il.sim.props import VERSION as DRAWN
 from manip_il.sim.scene import SCENES_KEPT
-from manip_il.sim.shape import Shape, stored
+from manip_il.sim.shape import MESH, Shape, stored
 from manip_il.sim.task import phases
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene, env_of
@@ -45,7 +44,7 @@ def is_known(robot: str, task: str, shape: str = "") -> bool:
     """Return whether this robot, task and object are built in."""
     if robot in STOCK:
         return task in STOCK[robot].tasks
-    return is_robot(robot) and is_task(task) and not is_stored(shape)
+    return is_robot(robot) and is_task(task) and not shape.startswith(MESH)
 
 
 def make_env(
@@ -70,9 +69,9 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
     pictures: dict[str, Any] = {"cameras": cameras.names, "image_size": cameras.size} if cameras else {}
     if config.robot in STOCK:
         robot = STOCK[config.robot]
-        stock = robot.tasks[config.task]
+        stock = robot.tasks[str(config.task)]
         return RobotTaskSpec(
-            robot=config.robot,
+            robot=str(config.robot),
             task=stock.name,
             fps=config.control_hz,
             joint_names=robot.joint_names,
@@ -111,7 +110,7 @@ def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> d
     """Return package versions, processor, and hashes of the compiled model and of environment and camera settings."""
     if cameras is None:
         return dict(_fingerprint(config))
-    drawn = DRAWN + (config.task.partition(":")[0] in _TURNED)
+    drawn = DRAWN + (str(config.task).partition(":")[0] in _TURNED)
     look = hashlib.sha256(f"{canonical_json(cameras)} {drawn}".encode()).hexdigest()
     return {**_fingerprint(config), "cameras_sha256": look}
 

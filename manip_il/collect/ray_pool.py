@@ -24,7 +24,6 @@ from manip_il.data.journal import Journal
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 from manip_il.sim.mesh import mesh_path
-from manip_il.tasks.table import SUFFIX
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
 try:
@@ -67,8 +66,8 @@ class RayPool:
     def submit(self, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None) -> Future[list[Episode]]:
         """Submit some seeds of a job to the cluster."""
         files = [self._upload(folder) for folder in job.driver.policies]
-        task = self._upload(Path(job.env.task)) if job.env.task.endswith(SUFFIX) else None
-        mesh = self._upload(Path(path)) if (path := mesh_path(job.env.object)) else None
+        task = self._upload(job.env.task) if isinstance(job.env.task, Path) else None
+        mesh = self._upload(path) if (path := mesh_path(job.env.object)) else None
         reference = _run_remote.remote(__version__, job, seeds, journal, task, mesh, *files)
         future: Future[list[Episode]] = Future()
         self._running[future] = reference
@@ -123,11 +122,11 @@ def run_there(
     with tempfile.TemporaryDirectory(prefix="manip_il-") as folder:
         if task is not None:
             file = _unpack(task, Path(folder) / "task") / Path(job.env.task).name
-            job = replace(job, env=replace(job.env, task=str(file)))
+            job = replace(job, env=replace(job.env, task=file))
         if mesh is not None:
-            path = mesh_path(job.env.object) or ""
-            at = _unpack(mesh, Path(folder) / "mesh") / Path(path).name
-            job = replace(job, env=replace(job.env, object=job.env.object.replace(path, str(at), 1)))
+            name = Path(str(job.env.object).removeprefix("mesh:")).name  # with the length
+            at = _unpack(mesh, Path(folder) / "mesh") / name
+            job = replace(job, env=replace(job.env, object=Path(f"mesh:{at}")))
         if isinstance(job.driver, PolicyDriver):
             here = tuple(_unpack(files, Path(folder) / str(number)) for number, files in enumerate(policies))
             job = replace(job, driver=replace(job.driver, policies=here))

@@ -75,6 +75,7 @@ class RobotTaskSpec:
         checks.name("robot", self.robot)
         checks.task_name(self.task)
         object.__setattr__(self, "fps", plain_rate(checks.number("fps", self.fps, 1)))
+        checks.object_name(self.object)
         for camera in self.cameras:
             checks.name("a camera", camera)
 

@@ -17,6 +17,7 @@ from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.results import FILE_NAME, EvalResult, require_equal
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
 from manip_il.evaluation.runner import FOLDER, Progress, Trial
+from manip_il.option import NameOrPath
 from manip_il.sim.conditions import Condition
 from manip_il.tasks.config import EnvConfig
 
@@ -65,14 +66,15 @@ class Member:
         result = trial.measure(self.policy, self.name, folder / FOLDER / words, engine, progress)
         return replace(self, result=result)
 
-    def env(self, task: str | None = None, shape: str | None = None) -> EnvConfig:
+    def env(
+        self, robot: NameOrPath | None = None, task: NameOrPath | None = None, shape: NameOrPath | None = None
+    ) -> EnvConfig:
         """Return the environment in which the member's run was validated.
 
-        task, shape: the file of an own task, and the object if it is a mesh: results hold only their names.
+        robot, task, shape: the user's own files, because results hold only the names of these.
         """
         found = EvalResult.read(_round_folder(self.path, self.history[0]))
-        settings = replace(found.settings, object=shape or found.settings.object)
-        return settings.env(found.robot, task or found.task)
+        return found.settings.env(robot or found.robot, task or found.task, shape)
 
     @property
     def conditions(self) -> tuple[Condition, ...]:

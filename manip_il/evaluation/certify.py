@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from manip_il.collect.environments import env_fingerprint
+from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
@@ -179,7 +179,8 @@ def certify(
     rows.append(row("start", "noise", f"{100 * NOISE:.0f} % noise on every action", noisy))
     settings = {"cases": cases, "seed": seed}
     settings |= {name: getattr(env, name) for name in ("horizon", "control_hz", "tolerance", "success_steps")}
-    return Certificate(env.robot, env.task, env_fingerprint(env), settings, tuple(rows))
+    spec = env_spec(env)
+    return Certificate(spec.robot, spec.task, env_fingerprint(env), settings, tuple(rows))
 
 
 def draw_moment(seed: int, kind: str, steps: int) -> int:

@@ -6,22 +6,24 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from pathlib import Path
+from itertools import chain
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 from manip_il import checks
 from manip_il.data.atomic import write_json
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
+from manip_il.option import NameOrPath
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.shape import stored
-from manip_il.tasks.config import make_config
+from manip_il.tasks.config import EnvConfig, complete
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
-    from manip_il.tasks.config import EnvConfig
 
 FILE_NAME = "eval.json"
+_MOST = 10**9  # of anything that is counted
 # keys of every episode, in the order of `EpisodeResult`
 _KEYS = {"seed": int, "success": bool, "success_at_end": bool, "steps": int, "return": float, "phase_at_end": str}
 
@@ -66,10 +68,11 @@ class EpisodeResult:
 
         Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or invalid.
         """
-        known = {"success_at_end": data["success"], "phase_at_end": ""} | {
-            key: data[key] for key in data if key in _KEYS
-        }
-        values: list[Any] = [convert(known[key]) for key, convert in _KEYS.items()]
+        values: list[Any] = [convert(data[key]) for key, convert in _KEYS.items()]
+        for name in ("drawn", "start", "end"):
+            checks.mapping(name, data.get(name, {}))
+        for number in chain(*data.get("start", {}).values(), [data.get("steps_to_success") or 0]):
+            checks.number("start or steps_to_success", number)
         return cls(*values, detail={key: value for key, value in data.items() if key not in _KEYS})
 
 
@@ -91,6 +94,13 @@ class EvalSettings:
     hold: int | None = None
     object: str = ""
 
+    def __post_init__(self) -> None:
+        for steps in (self.horizon, self.success_steps, self.control_hz, 0 if self.hold is None else self.hold):
+            checks.whole("horizon, success_steps, control_hz or hold", steps, 0, _MOST)
+        checks.number("tolerance", self.tolerance)
+        checks.text("suite", self.suite)
+        checks.object_name(self.object)
+
     @classmethod
     def of(cls, job: RolloutJob, suite: str = NOMINAL.name) -> EvalSettings:
         """Return the settings of a job whose conditions are called `suite`."""
@@ -98,10 +108,10 @@ class EvalSettings:
         steps, hz = env.success_steps, env.control_hz
         return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, stored(env.object))
 
-    def env(self, robot: str, task: str) -> EnvConfig:
-        """Return the environment of the evaluation."""
-        limits = {"tolerance": self.tolerance, "success_steps": self.success_steps, "horizon": self.horizon}
-        return make_config(robot, task, self.control_hz, **limits, object=self.object)
+    def env(self, robot: NameOrPath, task: NameOrPath, shape: NameOrPath | None = None) -> EnvConfig:
+        """Return the environment of the evaluation. shape: the object, if it is a mesh, as in `EnvConfig`."""
+        limits = self.tolerance, self.success_steps, self.horizon
+        return complete(EnvConfig(self.control_hz, *limits, robot, task, shape or self.object))
 
     @property
     def disturbance(self) -> str:
@@ -208,16 +218,17 @@ class EvalResult:
 
         Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or invalid.
         """
+        width = data["until_width"]
         return cls(
-            policy=data["policy"],
-            robot=str(data["robot"]),
-            # A path as task is refused, because it would run code. Older files store the reward in the settings.
-            task=checks.task_name(":".join(filter(None, (data["task"], data["settings"].get("reward"))))),
-            fingerprint=data["fingerprint"],
+            policy=checks.text("policy", data["policy"]),
+            # Older files store the path of a user's own robot, which is named like its file.
+            robot=checks.name("robot", PurePath(checks.text("robot", data["robot"])).stem),
+            task=checks.task_name(data["task"]),
+            fingerprint=checks.mapping("fingerprint", data["fingerprint"]),
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),
-            settings=EvalSettings.from_json(data["settings"]),
-            policy_sha256=data.get("policy_sha256", ""),
-            until_width=data.get("until_width"),
+            settings=EvalSettings.from_json(checks.mapping("settings", data["settings"])),
+            policy_sha256=checks.text("policy_sha256", data["policy_sha256"]),
+            until_width=None if width is None else checks.number("until_width", width),
         )
 
     def write(self, path: Path) -> None:

@@ -20,6 +20,7 @@ from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
 from manip_il.evaluation.tables import CLONING, EXPERT, Table
+from manip_il.option import NameOrPath
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
@@ -76,7 +77,7 @@ class RobotCheck:
     while it points down.
     """
 
-    name: str
+    name: NameOrPath
     robot: Robot
     opening: float
     table: float
@@ -90,7 +91,7 @@ class RobotCheck:
     def to_json(self) -> dict[str, Any]:
         """Return the contents of `check.json`."""
         return {
-            "robot": self.name,
+            "robot": str(self.name),
             "hand": self.robot.hand,
             "gripper": {"joints": self.robot.gripper.joints, "opening": self.opening},
             "reach": {"table": self.table},
@@ -99,7 +100,11 @@ class RobotCheck:
 
 
 def check_robot(
-    name: str, tasks: Sequence[str], episodes: int, engine: Engine, on_result: Callable[[EpisodeResult], object]
+    name: NameOrPath,
+    tasks: Sequence[str],
+    episodes: int,
+    engine: Engine,
+    on_result: Callable[[EpisodeResult], object],
 ) -> RobotCheck:
     """Measure a robot, given by name or YAML, on tasks. episodes: per task without random actions, and as many with.
 
@@ -119,7 +124,7 @@ def check_robot(
     return RobotCheck(name, robot, scene.gripper.most, table, tuple(checked))
 
 
-def check_starts(name: str, task: str) -> TaskCheck:
+def check_starts(name: NameOrPath, task: str) -> TaskCheck:
     """Draw up to `STARTS` starts of a task with a robot, as episodes do; stop at one without a valid placement."""
     the_task, starts = get_task(task), 0
     try:
@@ -245,7 +250,7 @@ def _at_home(scene: Scene) -> mujoco.MjData:
     return data
 
 
-def looks(name: str) -> tuple[Film, ...]:
+def looks(name: NameOrPath) -> tuple[Film, ...]:
     """Return pictures of a robot in its home pose, with the axes of its frame `ee`.
 
     Raises `RenderError` without off-screen OpenGL.

@@ -89,10 +89,11 @@ def evaluate(
     run = [seed for seed in seeds if seed <= max(results, default=-1)] if until_width else seeds
     if lost := [seed for seed in run if seed not in results]:
         _LOG.warning("left out of the evaluation, as each repeatedly killed its worker: seeds %s", lost)
+    spec = env_spec(job.env)
     return EvalResult(
         policy=name,
-        robot=job.env.robot,
-        task=env_spec(job.env).task,
+        robot=spec.robot,
+        task=spec.task,
         fingerprint=env_fingerprint(job.env, observed_cameras(job)),
         episodes=tuple(results[seed] for seed in seeds if seed in results),
         settings=EvalSettings.of(job, suite),

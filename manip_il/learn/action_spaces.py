@@ -41,9 +41,8 @@ from numpy.typing import NDArray
 
 from manip_il.caching import cached_per_thread
 from manip_il.data.schema import GRIPPERS, JOINT_TARGETS, RobotTaskSpec
-from manip_il.errors import MismatchError, UnknownName, UsageError
+from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET
-from manip_il.robots import ROBOTS
 from manip_il.robots.rotations import rotation_vector
 
 if TYPE_CHECKING:  # importing inverse kinematics takes a second
@@ -73,8 +72,6 @@ class Conversion:
     def __post_init__(self) -> None:
         if self.space != EE_DELTA:
             return
-        if self.robot not in ROBOTS:  # paths are refused too: the name may come from a downloaded checkpoint
-            raise UnknownName(f"robot for {EE_DELTA}:", self.robot, ROBOTS)
         if (joints := len(self._robot.joints)) < _POSE:
             raise UsageError(
                 f"{EE_DELTA} needs an arm with at least {_POSE} joints; {self.robot} has {joints}; use {JOINT_DELTA}"

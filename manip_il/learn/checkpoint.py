@@ -64,6 +64,7 @@ class Origin:
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
         checks.task_name(self.task)
+        checks.object_name(self.object)
         for name in ("joint_names", "environment_state_names", "cameras", "image_size"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
 

@@ -70,6 +70,8 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
         if "pretrained_backbone_weights" in saved:  # the checkpoint has the weights; torchvision would download its own
             options["pretrained_backbone_weights"] = None
         options |= given
+        if saved.get("states") and "states" not in given:  # a dataset's path, which only the user may name
+            raise UsageError(f"{source} learnt from a dataset of states; give it again with --policy.states=DATASET")
     require_trust({**options, "type": fit.kind}, source, fit.trust)
     config = typing.cast(PreTrainedConfig, decode(cls, options, source))
     config.push_to_hub = False  # LeRobot uploads by default; nothing leaves this machine unless asked to

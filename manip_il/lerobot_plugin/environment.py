@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, override
 
 import gymnasium
@@ -16,15 +17,15 @@ from lerobot.envs import EnvConfig
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import UnknownName, UsageError, silence_ffmpeg_warning
 from manip_il.learn.names import OBSERVATIONS
-from manip_il.option import option_of
+from manip_il.option import NameOrPath, option_of, typed
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import CAMERAS, CameraConfig
 from manip_il.sim.env import ManipEnv, environment_state_names
 from manip_il.tasks import ENV_IDS, TASK_IDS
 from manip_il.tasks.config import EnvConfig as SimConfig
-from manip_il.tasks.config import make_config
+from manip_il.tasks.config import complete
 from manip_il.tasks.envs import scene_of
-from manip_il.tasks.table import SUFFIX, get_task
+from manip_il.tasks.table import get_task
 
 TASKS = {env_id.removeprefix("manip_il/"): names for env_id, names in ENV_IDS.items()}
 ANY_ROBOTS = {env_id.removeprefix("manip_il/"): task for env_id, task in TASK_IDS.items()}
@@ -40,7 +41,8 @@ class ManipILEnv(EnvConfig):
     """One robot at one task, for lerobot-eval and lerobot-train.
 
     task: a name in gymnasium (`PandaPickPlace-v0`, `PickPlace-v0`), or the path of a file with a task of your own.
-    robot: for tasks of any robot (`PickPlace-v0`, a file), a name or YAML file; by default panda.
+    robot: for tasks of any robot (`PickPlace-v0`, a file), a name or YAML file; by default panda. A file is opened only
+    if it is named on the command line or, in Python, by a `Path`; not if a file of options names it.
     observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras:
     comma-separated names. observation_height, observation_width: size of their pictures [pixels]. fps, episode_length,
     tolerance, success_steps, object: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`.
@@ -98,17 +100,18 @@ class ManipILEnv(EnvConfig):
         return super().create_envs(n_envs, use_async_envs)
 
     def _simulation(self) -> SimConfig:
-        name, robot = self.task or "", self.robot or SimConfig.robot
-        base, colon, argument = (name, "", "") if name.endswith(SUFFIX) else name.partition(":")
-        if base not in TASKS and base not in ANY_ROBOTS and not name.endswith(SUFFIX):
+        name, robot = _given(self.task or ""), self.robot or SimConfig.robot
+        base, colon, argument = str(name).partition(":")
+        if base not in TASKS and base not in ANY_ROBOTS and not isinstance(name, Path):
             raise UnknownName("--env.task", name, {**TASKS, **ANY_ROBOTS})
         robot, task = TASKS.get(base) or (robot, ANY_ROBOTS.get(base, base))
         if self.robot and self.robot != robot:
             raise UsageError(
                 f"--env.robot is {self.robot!r}, but --env.task={name} is for {robot}; leave one of them out"
             )
-        limits = {"tolerance": self.tolerance, "success_steps": self.success_steps, "horizon": self.episode_length}
-        return make_config(robot, task + colon + argument, self.fps, **limits, object=self.object)
+        task = type(name)(task + colon + argument)
+        limits = self.tolerance, self.success_steps, self.episode_length
+        return complete(SimConfig(self.fps, *limits, _given(robot), task, _given(self.object)))
 
     def _cameras(self) -> CameraConfig | None:
         if self.observation == "state":
@@ -131,6 +134,11 @@ class ManipILEnv(EnvConfig):
             picture = PolicyFeature(FeatureType.VISUAL, (*cameras.size, 3))
             features |= {IMAGES + name: picture for name in cameras.names}
         return features
+
+
+def _given(text: NameOrPath) -> NameOrPath:
+    """Return `typed(text)` if the command line has it: LeRobot also reads options from files in checkpoints."""
+    return typed(text) if any(f"={word}".endswith(f"={text}") for word in sys.argv) else text
 
 
 class FilmedEnv(ManipEnv):

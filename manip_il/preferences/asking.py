@@ -30,7 +30,7 @@ _CAMERA = "front"
 Films = list[list[bytes]]  # MP4s of each pair, left and right
 
 
-def render_films(clips: Clips, robot: str | None = None, on_pair: Callable[[], None] = lambda: None) -> Films:
+def render_films(clips: Clips, robot: Path | None = None, on_pair: Callable[[], None] = lambda: None) -> Films:
     """Return MP4s of the left and right clip of every pair.
 
     robot: YAML of the sources' robot, if it is not a built-in one. Raises `RenderError` without off-screen OpenGL and

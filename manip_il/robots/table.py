@@ -13,23 +13,26 @@ from typing import Any
 from manip_il import checks
 from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.option import NameOrPath
 from manip_il.robots import ROBOTS
 from manip_il.robots.files import KEYS, ModelFiles, read
 from manip_il.robots.robot import FOUND, GRIPPER, SOFT, UPRIGHT, YAWS, CameraPose, Costs, GripperConfig, Robot
 from manip_il.robots.spec import arm_joints
 
-SUFFIXES = (".yaml", ".yml")
 SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
 _UPRIGHT_JOINTS = 6  # with fewer joints, a hand cannot point down everywhere
 GROUP = "manip_il.robots"  # entry points: a robot's name, and the path of its YAML
 
 
-def get_robot(name: str) -> Robot:
-    """Return a robot by its name, its YAML file or its entry point. Raises `UnknownName`, `UsageError`."""
+def get_robot(name: NameOrPath) -> Robot:
+    """Return a robot by its name or its entry point, or from the YAML at a `Path` that the user gave.
+
+    Raises `UnknownName`, `UsageError`.
+    """
+    if isinstance(name, Path):
+        return _read(name.absolute())
     if name in ROBOTS:
         return _read(ROBOTS[name])
-    if name.endswith(SUFFIXES):
-        return _read(Path(name).absolute())
     for found in entry_points(group=GROUP, name=name):
         try:
             path = Path(found.load())

@@ -14,6 +14,7 @@ import numpy as np
 
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.option import NameOrPath
 from manip_il.seeding import rng_for
 from manip_il.sim.config import CAMERAS
 from manip_il.sim.shape import KINDS, draws_shape
@@ -136,7 +137,7 @@ def turn_of(conditions: Sequence[Condition], seed: int) -> Condition:
     return conditions[seed % len(conditions)] if conditions else NOMINAL
 
 
-def draw(conditions: Sequence[Condition], seed: int, shape: str = "") -> dict[str, Any]:
+def draw(conditions: Sequence[Condition], seed: int, shape: NameOrPath = "") -> dict[str, Any]:
     """Return the values drawn for the episode of a seed, by name, from the condition that `turn_of` returns.
 
     shape: as in `EnvConfig.object`; if it is `any`, one of `KINDS` is drawn, too.

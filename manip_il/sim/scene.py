@@ -19,7 +19,7 @@ from manip_il.robots.rotations import angle_across, yaw_ahead
 from manip_il.robots.spec import add_wrist_camera, arm_spec, copy_options
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
-from manip_il.sim.rests import Hull
+from manip_il.sim.rests import LEAST_HEIGHT, LEAST_ROOM, Hull
 from manip_il.sim.task import Fitting, Task
 from manip_il.sim.variation import Object
 from manip_il.sim.world import Scene
@@ -154,20 +154,27 @@ def _check_objects(
     gripper: Gripper,
     hulls: Mapping[str, Hull],
 ) -> None:
-    """Raise `UsageError` for an object that the scene does not have, or that is too wide for the gripper."""
+    """Raise `UsageError` for an object that the scene does not have, or that is too wide or too low to grip."""
     for name in (*task.objects, *task.grasped):
         if name not in objects:
             raise UnknownName(f"object of task {task.name}", name, objects)
     for name in task.grasped:
+        rests = ""
         if name in hulls:
-            width = min(width for width, _ in hulls[name].rest(0).sizes)
+            rest = hulls[name].rest(0)
+            width, fits = min(width for width, _ in rest.sizes), rest.fits
+            rests = (
+                f"rests {rest.tall:.3f} m high ({LEAST_HEIGHT} m is the least; {LEAST_ROOM} m beside it must stay "
+                "free), "
+            )
         else:  # width between the fingers if the object lies on its worst side
             kind, size = int(model.geom_type[objects[name].geom]), model.geom_size[objects[name].geom]
             lengths = variation.extents(kind, size)
             width = float(np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0])
-        if width >= gripper.most:
+            fits = width < gripper.most
+        if not fits:
             raise UsageError(
-                f"task {task.name}: {name!r} is {width:.3f} m wide, and the gripper of {robot.name} opens to "
+                f"task {task.name}: {name!r} {rests}is {width:.3f} m wide, and the gripper of {robot.name} opens to "
                 f"{gripper.most:.3f} m; choose another object, task or robot"
             )
 

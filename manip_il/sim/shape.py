@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manip_il.errors import UnknownName, UsageError, shorten
+from manip_il.option import NameOrPath
 
 if TYPE_CHECKING:
     from manip_il.sim.mesh import Mesh
@@ -51,7 +54,7 @@ class Shape:
         if self.mesh is not None:
             if not SHORTEST <= max(self.lengths) <= LONGEST_MESH:
                 raise UsageError(
-                    f"{self.mesh.text} is {max(self.lengths):.3g} m long; expected {SHORTEST} to {LONGEST_MESH} m: "
+                    f"{self.mesh.stored} is {max(self.lengths):.3g} m long; expected {SHORTEST} to {LONGEST_MESH} m: "
                     "give the length of its longest side, as in mesh:mug.obj:0.1"
                 )
             return
@@ -64,16 +67,22 @@ class Shape:
             )
 
     @classmethod
-    def parse(cls, text: str) -> Shape:
-        """Return the shape that a text describes; raises `UnknownName` or `UsageError`."""
-        kind, colon, size = text.partition(":")
-        if kind == MESH or kind.lower().endswith((".stl", ".obj")):
+    def parse(cls, text: NameOrPath) -> Shape:
+        """Return the shape that a text describes, or a mesh, which only a `Path` can name (see `option.typed`).
+
+        Raises `UnknownName` or `UsageError`.
+        """
+        if isinstance(text, Path):
             from manip_il.sim.mesh import parse_mesh  # imported here: help needs no numpy
 
             mesh = parse_mesh(text)
             return cls(MESH, mesh.lengths, mesh)
+        kind, colon, size = text.partition(":")
+        if kind == MESH:
+            give = re.sub(r"^mesh:(?:.*/)?([^#]*)(#[0-9a-f]*)?", r"mesh:PATH/\1", text)
+            raise UsageError(f"object {text}: only the name of the mesh was stored; give --task.object={give}")
         if kind not in _SIZES:
-            raise UnknownName("shape", kind, _SIZES)
+            raise UnknownName("shape", kind, (*_SIZES, "mesh:FILE"))
         try:
             numbers = [float(number) for number in size.split("x")] if colon else [DEFAULT_WIDTH]
             return cls(kind, _lengths(kind, *numbers))
@@ -86,9 +95,9 @@ class Shape:
         return cls(kind, _lengths(kind, width))
 
     def __str__(self) -> str:
-        """Shortest text that `parse` reads as this shape."""
+        """Shortest text that `parse` reads as this shape; for a mesh, its text in datasets."""
         if self.mesh is not None:
-            return self.mesh.text
+            return self.mesh.stored
         numbers = self.lengths if self.kind == "box" else self.lengths[::2]
         if _lengths(self.kind, self.lengths[0]) == self.lengths:
             numbers = self.lengths[:1]
@@ -149,15 +158,14 @@ def _lengths(kind: str, first: float, second: float | None = None, *rest: float)
     return first, first, longer if second is None else second
 
 
-def draws_shape(text: str) -> bool:
+def draws_shape(text: NameOrPath) -> bool:
     """Return whether `text`, as in `Shape.parse`, asks for a shape that is drawn anew in each episode."""
-    return text.partition(":")[0] == ANY
+    return str(text).partition(":")[0] == ANY
 
 
-def stored(text: str) -> str:
+def stored(text: NameOrPath) -> str:
     """Return an object's text as datasets store it: for a mesh, with the file's name and hash in place of its path."""
-    mesh = Shape.parse(text).mesh if text else None
-    return text if mesh is None else mesh.stored
+    return str(Shape.parse(text)) if isinstance(text, Path) else text
 
 
 ROLLING = 0.005  # rolling friction of round objects, as on a cloth: dropped ones stay within reach [m]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UsageError, shorten
+from manip_il.option import NameOrPath
 from manip_il.robots.robot import Robot
 from manip_il.sim.shape import Shape
 from manip_il.sim.world import World
@@ -169,8 +170,8 @@ class TakesShape(Protocol):
 class TakesArgument(Protocol):
     """A task with variants, called `NAME:ARGUMENT`; the state holds an episode's variant."""
 
-    def with_argument(self, text: str) -> Task:
-        """Return the variant that a text describes; its name is `NAME` or `NAME:A=NUMBER,B=NUMBER`."""
+    def with_argument(self, text: NameOrPath) -> Task:
+        """Return the variant that a text or a file describes; its name is `NAME` or `NAME:A=NUMBER,B=NUMBER`."""
         ...
 
     @property

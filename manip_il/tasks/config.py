@@ -8,7 +8,7 @@ from typing import Any
 
 from manip_il.checks import check_unchanged
 from manip_il.errors import UnknownName, UsageError
-from manip_il.option import check_bounds, make_options, option
+from manip_il.option import NameOrPath, check_bounds, make_options, option, typed
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import MOST_HZ, Episodes
 from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
@@ -30,12 +30,14 @@ TASK_HELP = (
 class EnvConfig(Episodes):
     """Settings of one environment; every field is part of the fingerprint. `make_config` checks and completes them.
 
-    object: shape and size of what is grasped, as `Shape.parse` reads it; empty for the task's default.
+    robot, task: a name, or the `Path` of a user's own file. object: shape and size of what is grasped, as `Shape.parse`
+    reads it, or the `Path` of a mesh; empty for the task's default. A name that was stored is a `str`, which no code
+    takes for a path.
     """
 
-    robot: str = option("panda", ROBOT_HELP, flag="robot.type")
-    task: str = option("pick_place", TASK_HELP, flag="task.type")
-    object: str = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
+    robot: NameOrPath = option("panda", ROBOT_HELP, flag="robot.type")
+    task: NameOrPath = option("pick_place", TASK_HELP, flag="task.type")
+    object: NameOrPath = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
 
     @property
     def name(self) -> str:
@@ -44,24 +46,56 @@ class EnvConfig(Episodes):
 
 
 def make_config(
-    robot: str = EnvConfig.robot, task: str = EnvConfig.task, control_hz: float = 0, **settings: Any
+    robot: NameOrPath = EnvConfig.robot,
+    task: NameOrPath = EnvConfig.task,
+    control_hz: int = 0,
+    **settings: Any,
 ) -> EnvConfig:
     """Return the settings of an environment; what is not given comes from its robot and task.
 
-    control_hz: whole, 0 for the robot's own [Hz]. settings: other `EnvConfig` fields. Raises `UnknownName` (robot or
-    task) or `UsageError` (a wrong value).
+    This function is for what a person wrote: names that end in `.py` or `.yaml` and objects `mesh:FILE` are paths. What
+    is stored goes to `complete`, where a `str` is a name.
+
+    Args:
+        robot: Its name, or the path of its YAML.
+        task: Its name, or the path of its Python file.
+        control_hz: Control steps per second; 0 for the robot's own.
+        settings: Other fields of `EnvConfig`.
+
+    Raises:
+        UnknownName: for a robot or a task.
+        UsageError: for a wrong value.
     """
-    if isinstance(control_hz, float) and control_hz % 1:
-        raise UsageError(f"control_hz is {control_hz}; expected a whole number, as environments are simulated at one")
-    control_hz = int(control_hz) if isinstance(control_hz, float) else control_hz
-    named = {"robot": robot, "task": task, "control_hz": control_hz}
-    return complete(make_options(EnvConfig, **named, **settings))
+    settings |= {"robot": typed(robot), "task": typed(task), "object": typed(settings.get("object", ""))}
+    return complete(make_options(EnvConfig, control_hz=control_hz, **settings))
+
+
+def stored_config(
+    spec: Any, robot: NameOrPath | None = None, task: NameOrPath | None = None, shape: NameOrPath | None = None
+) -> EnvConfig:
+    """Return the settings of the environment that a dataset or a policy names; what it names is never a path.
+
+    Args:
+        spec: A `RobotTaskSpec` or an `Origin`.
+        robot: What the user gave, which replaces the name in `spec`; the same for the task.
+        task: See `robot`.
+        shape: See `robot`; the object.
+
+    Raises:
+        UsageError: if something that is not built in was not given, and whatever else `make_config` raises.
+    """
+    named = {"robot": robot or spec.robot, "task": task or spec.task, "object": shape or spec.object}
+    return complete(replace(EnvConfig(spec.fps), **named))
 
 
 def complete(config: EnvConfig) -> EnvConfig:
     """Return settings with 0 and empty values filled in from robot and task; raises what `make_config` raises."""
     from manip_il.mdp import LONGEST_EPISODE  # imported here: help needs no numpy
 
+    if isinstance(config.control_hz, float):
+        raise UsageError(
+            f"control_hz is {config.control_hz}; expected a whole number, as environments are simulated at one"
+        )
     check_bounds(config)
     config = _of_stock(config) if config.robot in stock.ROBOTS else _with_task(config)
     if not 1 <= config.control_hz <= MOST_HZ:
@@ -85,15 +119,16 @@ def _with_task(config: EnvConfig) -> EnvConfig:
     from manip_il.tasks.table import get_task
 
     task, robot = get_task(config.task), get_robot(config.robot)
-    for file in (config.task, config.robot, mesh_path(config.object) or ""):
-        if Path(file).suffix:
-            check_unchanged(Path(file))
+    for file in (config.task, config.robot, mesh_path(config.object)):
+        if isinstance(file, Path):
+            check_unchanged(file)
     if isinstance(task, TakesArgument):
         config = replace(config, task=task.name)
     if config.object:
         shape, other = Shape.parse(config.object), get_task(config.task, config.object)
         is_own = shape == getattr(task, "shape", CUBE)
-        task, config = task if is_own else other, replace(config, object="" if is_own else str(shape))
+        named = config.object if isinstance(config.object, Path) else str(shape)
+        task, config = task if is_own else other, replace(config, object="" if is_own else named)
     limits, control_hz = task.limits, config.control_hz or robot.fps
     rate = control_hz / LIMITS_HZ
     return replace(
@@ -109,7 +144,7 @@ def _of_stock(config: EnvConfig) -> EnvConfig:
     """Return settings with the stock robot's fixed values; raises `UsageError` if another value was given."""
     robot = stock.ROBOTS[config.robot]
     if config.task not in robot.tasks:
-        raise UnknownName(f"task of {config.robot}", config.task, robot.tasks)
+        raise UnknownName(f"task of {config.robot}", str(config.task), robot.tasks)
     if config.object:
         raise UsageError(f"object is {config.object}; {config.robot} is unmodified, so omit --task.object")
     for name, value in robot.fixed.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from manip_il.option import NameOrPath
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.sim.conditions import Condition
@@ -16,10 +17,10 @@ from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.table import get_task
 
 
-def scene_of(robot: str, task: str, shape: str = "") -> Scene:
-    """Return the compiled scene of a robot and a task, given by name or file.
+def scene_of(robot: NameOrPath, task: NameOrPath, shape: NameOrPath = "") -> Scene:
+    """Return the compiled scene of a robot, a task and an object, as in `EnvConfig`.
 
-    shape: as in `EnvConfig.object`. Raises `UnknownName`, `UsageError`.
+    Raises `UnknownName`, `UsageError`.
     """
     return build_scene(get_robot(robot), get_task(task, shape))
 
@@ -35,8 +36,8 @@ def env_of(config: EnvConfig, cameras: CameraConfig | None = None, conditions: S
 
 
 def make_env(
-    robot: str = EnvConfig.robot,
-    task: str = EnvConfig.task,
+    robot: NameOrPath = EnvConfig.robot,
+    task: NameOrPath = EnvConfig.task,
     *,
     cameras: Sequence[str] = (),
     image_size: tuple[int, int] = (128, 128),

@@ -1,6 +1,7 @@
 """Tasks by name: those that ship, a user's Python file, or a name that an installed package provides.
 
-A file runs only if the user gives its path, never because a dataset, a checkpoint or a result names its task.
+A file runs only if the user gives its `Path`, never because a dataset, a checkpoint or a result names its task: what
+these store is a `str`, which is a name.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.errors import OWN, UnknownName, UsageError
+from manip_il.option import NameOrPath
 from manip_il.sim.shape import Shape
 from manip_il.sim.task import TakesArgument, TakesShape, Task
 from manip_il.tasks.carry.task import Carry
@@ -51,30 +53,39 @@ TASKS: dict[str, Task] = {
 }
 
 
-def get_task(name: str, shape: str = "") -> Task:
-    """Return a task by its name, `NAME` or `NAME:ARGUMENT`, or by the path of its Python file.
+def get_task(name: NameOrPath, shape: NameOrPath = "") -> Task:
+    """Return a task by its name, `NAME` or `NAME:ARGUMENT`, or from a file of the user's own.
 
-    shape: the object's, as `Shape.parse` reads it; empty for the task's default. Raises `UnknownName`; `UsageError` for
-    a file without a task, or for an argument or a shape that is invalid or that the task does not take.
+    Args:
+        name: A name or, as `option.typed` returns it, the `Path` of a Python file, or of a `carry:reward.json`.
+        shape: The object's, as `Shape.parse` reads it; empty for the task's default.
+
+    Raises:
+        UnknownName: if no task has this name.
+        UsageError: for a file without a task, or an argument or a shape that is invalid or that the task does not take.
     """
-    if name.endswith(SUFFIX):
-        task = _of_file(Path(name).absolute())
+    if isinstance(name, Path) and name.suffix == SUFFIX:
+        task = _of_file(name.absolute())
     else:
-        base, colon, argument = name.partition(":")
+        base, colon, argument = str(name).partition(":")
         task = _named(base)
         if colon:
             if not isinstance(task, TakesArgument):
-                raise UsageError(f"task is {name!r}, but only {_who(TakesArgument)} takes an argument after a colon")
-            task = task.with_argument(argument)
+                raise UsageError(
+                    f"task is {checks.shorten(str(name))}, but only {_who(TakesArgument)} takes an argument after a "
+                    "colon"
+                )
+            task = task.with_argument(Path(argument) if isinstance(name, Path) else argument)
     if shape and not isinstance(task, TakesShape):
         raise UsageError(
-            f"object is {shape!r}, but the objects of {name} are fixed; only {_who(TakesShape)} take others"
+            f"object is {checks.shorten(str(shape))}, but the objects of {name} are fixed; only {_who(TakesShape)} "
+            "take others"
         )
     return _shaped(task, shape) if shape else task
 
 
 @cache  # the same text gives the same task, so that its scene is built once
-def _shaped(task: TakesShape, shape: str) -> Task:
+def _shaped(task: TakesShape, shape: NameOrPath) -> Task:
     return task.with_shape(Shape.parse(shape))
 
 

@@ -91,8 +91,8 @@ class Shift:
     def to_json(self) -> dict[str, Any]:
         """Return all numbers except the positions."""
         return {
-            "robot": self.env.robot,
-            "task": self.env.task,
+            "robot": env_spec(self.env).robot,
+            "task": env_spec(self.env).task,
             "horizon": self.env.horizon,
             "expert_cost": self.expert_cost,
             "u": self.u,

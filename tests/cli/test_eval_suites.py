@@ -141,7 +141,7 @@ def test_every_line_of_eval_json_can_be_replayed_alone(act, here, capsys):
     result = EvalResult.read(Path("e"))
     for episode in result.episodes:
         capsys.readouterr()
-        assert main(["eval", "e/eval.json", f"--replay={episode.seed}"]) == 0
+        assert main(["eval", "e/eval.json", f"--replay={episode.seed}", f"--policy.path={act}"]) == 0
         out, err = capsys.readouterr()
         assert f"seed {episode.seed}, {episode.detail['condition']}: failure" in out
         assert "the same as in e/eval.json" in out
@@ -153,23 +153,23 @@ def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys, error):
     edit_json(Path("e/eval.json"), lambda data: data["episodes"][0].update({"success": True, "return": 3.0}))
     edit_json(Path("e/eval.json"), lambda data: data["episodes"][1]["drawn"].update(delay=77))
     capsys.readouterr()
-    assert main(["eval", "e", "--replay=4000000"]) == 1
+    assert main(["eval", "e", "--replay=4000000", f"--policy.path={act}"]) == 1
     line = error()
     assert "success was True, is False" in line
     assert "return was 3.0, is 0.0" in line
-    assert main(["eval", "e", "--replay=4000001"]) == 1
+    assert main(["eval", "e", "--replay=4000001", f"--policy.path={act}"]) == 1
     assert "what is drawn for the episode differs" in error()
     assert main(["eval", "e", "--replay=2"]) == 2
     assert "has seeds 4000000 to 4000001" in error()
 
 
-def test_a_replay_finds_a_policy_that_has_moved_and_knows_another_one(here, capsys, error):
+def test_a_replay_takes_the_policy_that_is_given_and_knows_another_one(here, capsys, error):
     act = write_checkpoint(here / "act", "act", env_spec(ENV))
     assert evaluate("e", "--policy.path=act", "--eval.n_episodes=1", "--task.type=pick_place", *SMALL) == 0
-    act.rename(here / "moved")
     capsys.readouterr()
     assert main(["eval", "e", "--replay=4000000"]) == 2
-    assert "no policy in act" in error()
+    assert "'act'; give that with --policy.path=DIR" in error()
+    act.rename(here / "moved")
     assert main(["eval", "e", "--replay=4000000", "--policy.path=moved"]) == 0
     assert "files differ" not in capsys.readouterr().err
     other = write_checkpoint(here / "other", "act", env_spec(ENV), chunk_size=4)
@@ -186,5 +186,5 @@ def test_failures_and_successes_are_filmed_and_a_replay_films_one(act, here):
     assert evaluate("bad", *words, "--eval.films=2") == 0
     page = Path("bad/report.html").read_text()
     assert page.count("<video") == 2
-    assert main(["eval", "bad", "--replay=4000001", "--video=deep/one.mp4"]) == 0
+    assert main(["eval", "bad", "--replay=4000001", f"--policy.path={act}", "--video=deep/one.mp4"]) == 0
     assert base64.b64encode(Path("deep/one.mp4").read_bytes()).decode() in page

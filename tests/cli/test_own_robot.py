@@ -34,7 +34,7 @@ def test_it_is_recorded_learnt_evaluated_improved_and_rendered(
     assert "warning" not in capsys.readouterr().err
     words = ["eval", robot, *REACH, "--policy.path=run", "--eval.n_episodes=1", "--eval.films=0", "--output_dir=test"]
     assert main(words) == 0
-    assert json.loads(Path("test/eval.json").read_text())["robot"] == "arms/mine.yaml"
+    assert json.loads(Path("test/eval.json").read_text())["robot"] == "mine"
     assert main(["dagger", robot, *REACH, *SHORT, "--output_dir=dagger"]) == 0
     assert (tmp_path / "dagger" / "best").is_dir()
     render = ["data", "render", "datasets/mine_reach", "seen", "--cameras=front"]

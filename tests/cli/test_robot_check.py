@@ -25,7 +25,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def with_map(path: Path) -> Path:
-    place = reach._place(get_robot(str(path)))
+    place = reach._place(get_robot(path))
     place.parent.mkdir(parents=True, exist_ok=True)
     np.savez(place, origin=np.array([-1.0, -1.0, 0.0]), errors=np.zeros((41, 41, 21)))
     return path

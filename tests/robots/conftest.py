@@ -13,4 +13,4 @@ from .own import write
 @pytest.fixture
 def own(tmp_path: Path) -> Robot:
     """An arm of a user's own."""
-    return get_robot(str(write(tmp_path)))
+    return get_robot(write(tmp_path))

@@ -41,8 +41,8 @@ def test_the_target_is_in_the_middle_of_the_picture(pose, tmp_path):
 
 
 def test_what_is_not_said_stays_and_another_cameras_place_is_that_of_every_robot(tmp_path):
-    own = scene_of(str(write(tmp_path, tree=placed({"front": PLACED["obliquely"]}))), "reach").model
-    plain = scene_of(str(write(tmp_path, "plain")), "reach").model
+    own = scene_of(write(tmp_path, tree=placed({"front": PLACED["obliquely"]})), "reach").model
+    plain = scene_of(write(tmp_path, "plain"), "reach").model
     front, side = (camera_id(own, name) for name in ("front", "side"))
     np.testing.assert_allclose(own.cam_pos[front], PLACED["obliquely"]["position"])
     assert own.cam_fovy[front] == 50
@@ -51,7 +51,7 @@ def test_what_is_not_said_stays_and_another_cameras_place_is_that_of_every_robot
 
 def test_the_table_is_as_large_and_as_high_as_said(tmp_path):
     tree = tree_of("slides") | {"table": {"size": [0.8, 0.7], "height": 0.75}}
-    model = scene_of(str(write(tmp_path, tree=tree)), "reach").model
+    model = scene_of(write(tmp_path, tree=tree), "reach").model
     np.testing.assert_allclose(2 * model.geom("table").size[:2], [0.8, 0.7])
     assert model.geom("table").pos[2] + model.geom("table").size[2] == 0.0
     assert model.geom("floor").pos[2] == -0.75

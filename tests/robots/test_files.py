@@ -28,7 +28,7 @@ def shaped(folder: Path, file: str, mesh: str, **more: Any) -> Robot:
     for old, new in more.pop("text", {}).items():
         assert old in model
         model = model.replace(old, new)
-    return get_robot(str(write(folder, tree=tree_of() | more, model=model)))
+    return get_robot(write(folder, tree=tree_of() | more, model=model))
 
 
 PLACES: dict[str, tuple[str, str, dict[str, Any]]] = {
@@ -63,7 +63,7 @@ def test_what_a_model_includes_is_found_where_the_yaml_says_and_what_lies_beside
         tree=tree_of() | {"includes": "parts", "meshes": "."},
         model=(tmp_path / "own.xml").read_text(),
     )
-    assert arm_spec(get_robot(str(again))).compile().nmeshvert == 4
+    assert arm_spec(get_robot(again)).compile().nmeshvert == 4
 
 
 def with_shoe(folder: Path) -> Robot:

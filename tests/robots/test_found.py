@@ -39,7 +39,7 @@ def path(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.fixture(scope="module")
 def own(path: Path) -> Robot:
-    return get_robot(str(path))
+    return get_robot(path)
 
 
 def test_the_arms_joints_are_those_from_base_to_hand(own: Robot):
@@ -77,7 +77,7 @@ def test_what_is_found_is_the_same_again(own: Robot, path: Path):
 
 def test_what_the_yaml_says_is_not_sought(tmp_path: Path):
     said = {name: tree_of()[name] for name in ("joints", "home", "gains")}
-    robot = get_robot(str(write(tmp_path, tree=short(**said, armature=[0.3] * 5))))
+    robot = get_robot(write(tmp_path, tree=short(**said, armature=[0.3] * 5)))
     assert robot.home == tuple(said["home"])
     assert robot.gains == tuple(said["gains"])
     assert robot.armature == (0.3,) * 5
@@ -95,7 +95,7 @@ def test_the_base_that_is_proposed_for_an_arm_out_of_reach_has_the_workspace_wit
 def test_limits_of_motors_are_those_of_the_model(tmp_path: Path):
     weak = '<motor joint="turn" gear="50" ctrlrange="-1 1" ctrllimited="true"/>'
     model = ARM.replace('<motor name="motor" joint="turn"/>', weak).replace("FINGERS", JAWS["slides"][0])
-    assert get_robot(str(write(tmp_path, tree=short(), model=model))).forces[:2] == (50.0, 200.0)
+    assert get_robot(write(tmp_path, tree=short(), model=model)).forces[:2] == (50.0, 200.0)
 
 
 @pytest.mark.slow
@@ -110,7 +110,7 @@ def test_the_expert_drives_an_arm_of_a_short_yaml(path: Path, task: str):
 def test_an_example_says_little_and_is_found_whole(example: Path):
     said = [line for line in example.read_text().splitlines() if line.strip() and not line.startswith("#")]
     assert len(said) <= 15
-    robot = get_robot(str(example))
+    robot = get_robot(example)
     opens = sweep(robot)
     assert opens.openings[0] < 0.01
     assert opens.openings[-1] > 0.06

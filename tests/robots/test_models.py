@@ -110,7 +110,7 @@ def test_an_arm_is_the_same_in_degrees_and_in_radians_and_if_its_hand_is_in_the_
         folder = tmp_path / str(place)
         folder.mkdir()
         path = write(folder, tree=short("hinges"), model=in_unit(unit) if place < 2 else attached(folder, unit))
-        found.append(get_robot(str(path)))
+        found.append(get_robot(path))
         models.append(arrays(arm_spec(found[-1]).compile()))
         suggested.append(suggest(path.with_name("own.xml")))
     for robot, model, draft in zip(found[1:], models[1:], suggested[1:], strict=True):
@@ -138,7 +138,7 @@ def test_a_fixed_joint_is_where_mujoco_has_it(joint: str, value: float, tmp_path
     )
     joints = ["turn", "shoulder", "elbow", "second", "wrist", "roll"]
     tree = short("hinges") | {"ee": tree_of()["ee"], "joints": joints, "home": [0.1] * 6, "gains": [100] * 6}
-    whole = get_robot(str(write(tmp_path, "whole", tree=tree, model=model)))
+    whole = get_robot(write(tmp_path, "whole", tree=tree, model=model))
     apart = [name for name in joints if name != joint]
     fixed = replace(
         whole,
@@ -169,7 +169,7 @@ def test_what_is_bolted_on_keeps_its_name(kind: str, tmp_path: Path):
     found = suggest(path)
     assert (found["hand"], set(found["gripper"]["fingers"])) == ("hand", {"left", "right"})
     tree = tree_of() | {"hand": "hand", "gripper": found["gripper"], "joints": suggest_joints(kind)}
-    robot = get_robot(str(write(tmp_path, tree=tree, model=model)))
+    robot = get_robot(write(tmp_path, tree=tree, model=model))
     bodies = [arm_spec(robot).compile().body(name).id for name in ("base", "hand")]
     assert bodies[0] == 1
     assert arm_model(robot).body("hand").id > bodies[0]
@@ -211,7 +211,7 @@ def test_of_a_scene_around_a_robot_only_the_robot_is_taken(tmp_path: Path):
     scene = scene.replace('mquat="1 0 0 0"', 'mquat="1 0 0 0" qpos="0 0 0 0 0 0 0 1 0 0 0 0 0 0"')
     (tmp_path / "around").mkdir()
     alone, inside = (
-        arm_spec(get_robot(str(write(folder, model=model)))).compile()
+        arm_spec(get_robot(write(folder, model=model))).compile()
         for folder, model in ((tmp_path, model_of()), (tmp_path / "around", scene))
     )
     assert [inside.body(i).name for i in range(inside.nbody)] == [alone.body(i).name for i in range(alone.nbody)]

@@ -163,7 +163,7 @@ def test_a_map_is_the_same_whether_it_is_worked_out_or_read(own: Robot, monkeypa
 def test_another_model_has_a_map_of_its_own(change: Callable[[str], str], maps: int, solved: list[str], tmp_path: Path):
     for folder, text in ((tmp_path / "one", model_of()), (tmp_path / "other", change(model_of()))):
         folder.mkdir()
-        read_again(get_robot(str(write(folder, model=text))))
+        read_again(get_robot(write(folder, model=text)))
     assert solved == ["own"] * maps
     assert len(list((tmp_path / "cache" / "manip_il").iterdir())) == maps
 

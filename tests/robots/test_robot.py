@@ -29,14 +29,14 @@ from .own import tree_of, write
 def refusal(path: Path, task: str = "reach") -> str:
     """The one line that a robot's YAML is refused with."""
     with pytest.raises(UsageError) as caught:
-        scene_of(str(path), task)
+        scene_of(path, task)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
 def test_an_arm_from_a_yaml_is_a_scene_and_has_the_files_name(tmp_path: Path):
     path = write(tmp_path, "six_axes")
-    scene = scene_of(str(path), "reach")
+    scene = scene_of(path, "reach")
     assert scene.robot.name == "six_axes"
     assert scene.robot.joint_names == ("turn", "shoulder", "elbow", "wrist", "roll", "gripper")
     assert scene.name == "six_axes reach"
@@ -54,8 +54,8 @@ def test_an_arm_from_a_yaml_is_driven_to_the_goal(tmp_path: Path, monkeypatch):
 def test_a_yaml_is_found_from_the_current_folder(tmp_path: Path, monkeypatch):
     write(tmp_path, "near")
     monkeypatch.chdir(tmp_path)
-    assert get_robot("near.yaml").name == "near"
-    assert get_robot("./near.yaml").files.model == tmp_path / "own.xml"
+    assert get_robot(Path("near.yaml")).name == "near"
+    assert get_robot(Path("./near.yaml")).files.model == tmp_path / "own.xml"
 
 
 def test_an_arm_of_ones_own_is_known_by_what_its_yaml_says(tmp_path: Path):
@@ -72,9 +72,9 @@ def test_a_copy_of_a_built_in_arm_needs_a_name_of_its_own_and_leans_as_it_does(t
     text = ROBOTS["so101"].read_text()
     (tmp_path / "so101.yaml").write_text(text)
     with pytest.raises(UsageError, match="a built-in robot is called so101; rename the file"):
-        get_robot(str(tmp_path / "so101.yaml"))
+        get_robot(tmp_path / "so101.yaml")
     (tmp_path / "mine.yaml").write_text(f"{text}\ncosts: {{orientation: 0.03}}\n")
-    assert get_robot(str(tmp_path / "mine.yaml")).leans
+    assert get_robot(tmp_path / "mine.yaml").leans
 
 
 def but(**changes: Any) -> dict[str, Any]:
@@ -118,7 +118,7 @@ def test_a_gripper_too_small_for_the_tasks_cube_is_one_line(tmp_path: Path):
     path = write(tmp_path, tree=inside("gripper", open=[0.02, 0.02]))
     line = refusal(path, "pick_place")
     assert "task pick_place: 'object' is 0.050 m wide, and the gripper of own opens to 0.042 m" in line
-    assert scene_of(str(path), "reach").gripper.most < 0.05
+    assert scene_of(path, "reach").gripper.most < 0.05
 
 
 def test_nothing_that_belongs_to_a_world_is_left_of_a_model(own: Robot):
@@ -150,7 +150,7 @@ def test_a_scene_has_the_worlds_cameras_lamps_and_sky_alone(robot: str):
 
 def test_a_base_moves_the_robot(tmp_path: Path):
     plain, moved = write(tmp_path, "plain"), write(tmp_path, "moved", tree=tree_of() | {"base": [0.1, 0.2, -0.3]})
-    ees = [ArmIK(get_robot(str(path))).ee_pose(np.zeros(5))[0] for path in (plain, moved)]
+    ees = [ArmIK(get_robot(path)).ee_pose(np.zeros(5))[0] for path in (plain, moved)]
     np.testing.assert_allclose(ees[1] - ees[0], [0.1, 0.2, -0.3], atol=1e-9)
 
 

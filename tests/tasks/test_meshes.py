@@ -23,7 +23,7 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.sim.rests import LEAST_ROOM
 from manip_il.sim.shape import DENSITY, LIGHTEST, Shape
 from manip_il.sim.world import World
-from manip_il.tasks.config import make_config
+from manip_il.tasks.config import make_config, stored_config
 from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.grasp import lie_of
 from tests.meshes import MESHES, write_mesh
@@ -61,14 +61,15 @@ def test_other_tasks_take_it_too(task, folder):
 def test_every_kind_of_file_is_the_same_solid(ending, tmp_path):
     path, solid = tmp_path / f"angle{ending}", MESHES["angle"]()
     solid.export(path, file_type="stl_ascii" if "ascii" in ending else None)
-    shape = Shape.parse(f"mesh:{path}:0.05")
+    shape = Shape.parse(Path(f"mesh:{path}:0.05"))
     assert max(shape.lengths) == pytest.approx(0.05)
     assert shape.mass == pytest.approx(max(LIGHTEST, DENSITY * solid.volume * (0.05 / 0.07) ** 3), rel=1e-5)
     np.testing.assert_allclose(shape.mesh.vertices.min(axis=0), np.array((-0.0275, -0.0225, -0.0125)) / 1.4, atol=1e-6)
 
 
 def test_the_model_has_its_mass_its_centre_of_mass_and_its_picture(folder):
-    shape, scene = Shape.parse(text(folder, "bottle")), scene_of("panda", "pick_place", text(folder, "bottle"))
+    bottle = Path(text(folder, "bottle"))
+    shape, scene = Shape.parse(bottle), scene_of("panda", "pick_place", bottle)
     one, model = scene.objects[OBJECT], scene.model
     assert model.body_mass[one.body] == pytest.approx(shape.mass) == pytest.approx(DENSITY * MESHES["bottle"]().volume)
     np.testing.assert_allclose(model.body_ipos[one.body], 0, atol=1e-5)
@@ -125,7 +126,7 @@ def test_data_have_its_name_and_hash_and_no_path(folder, tmp_path):
     assert env_fingerprint(make_config("panda", object=f"mesh:{moved}:0.06")) == before
     assert not is_known("panda", "pick_place", spec.object)
     with pytest.raises(UsageError, match=r"name of the mesh was stored; give --task\.object=mesh:PATH/mug\.obj:0\.06"):
-        make_config("panda", object=spec.object)
+        stored_config(spec)
 
 
 def test_a_dataset_and_an_evaluation_of_it_are_used_with_its_file(folder, tmp_path, monkeypatch, capsys):
@@ -153,7 +154,7 @@ def test_a_node_gets_the_file(folder, tmp_path):
     job = RolloutJob(make_config("panda", object=f"mesh:{path}"), hold=0)
     [here], files = list(job.run([5])), {"wedge.obj": path.read_bytes()}
     path.unlink()
-    away = replace(job, env=replace(job.env, object=f"mesh:{tmp_path / 'elsewhere' / 'wedge.obj'}"))
+    away = replace(job, env=replace(job.env, object=Path(f"mesh:{tmp_path / 'elsewhere' / 'wedge.obj'}")))
     [(there, _)] = pickle.loads(zstandard.decompress(run_there(manip_il.__version__, away, (5,), None, None, files)))
     for name, column in here.without_pictures().columns.items():
         np.testing.assert_array_equal(there.columns[name], column)
@@ -172,15 +173,23 @@ MISTAKES = {
         "own.stl",
         "m wide, and the gripper of panda opens",
     ),
+    "is too low as it rests": (
+        trimesh.creation.box((0.06, 0.05, 0.008)).export,
+        "own.stl",
+        "rests 0.008 m high (0.012 m is the least",
+    ),
+    "has no triangles": (lambda path: path.write_text("o nothing\n"), "own.obj", "own.obj is empty"),
+    "has no bytes": (lambda path: path.write_bytes(b""), "own.stl", "own.stl is empty"),
     "is in millimetres": (trimesh.creation.box((50, 40, 30)).export, "own.stl", "is 50 m long; expected 0.02 to 0.2 m"),
 }
 
 
+@pytest.mark.parametrize("command", [["eval", "--policy.type=expert", "--output_dir=out"], ["record"]])
 @pytest.mark.parametrize("case", MISTAKES)
-def test_a_mesh_that_cannot_be_used_is_one_line(case, tmp_path, capsys):
+def test_a_mesh_that_cannot_be_used_is_one_line(case, command, tmp_path, monkeypatch, capsys):
     write, name, says = MISTAKES[case]
+    monkeypatch.chdir(tmp_path)
     write(tmp_path / name)
-    mesh = f"--task.object=mesh:{tmp_path / name}"
-    assert main(["eval", "--policy.type=expert", mesh, f"--output_dir={tmp_path / 'e'}"]) == 2
+    assert main([*command, f"--task.object=mesh:{tmp_path / name}"]) == 2
     error = capsys.readouterr().err
     assert (error.count("\n"), says in error) == (1, True), error

@@ -94,7 +94,7 @@ def test_files_that_were_edited_since_they_were_read_are_refused(tmp_path, touch
 
 def test_a_number_is_no_point_of_the_scene(tmp_path):
     (tmp_path / "own.py").write_text(TOUCH.replace('"cube": cube,', '"cube": cube[2],'))
-    assert "cube" not in point_names(scene_of("panda", str(tmp_path / "own.py")))
+    assert "cube" not in point_names(scene_of("panda", tmp_path / "own.py"))
 
 
 def test_gymnasium_and_python_take_the_path(touch):
@@ -131,7 +131,7 @@ def test_data_and_results_name_a_task_and_run_nothing(touch, tmp_path, monkeypat
     assert not is_known("panda", "touch")
     with pytest.raises(ManipError, match="unknown task 'touch'"):
         open_source(tmp_path / "data")
-    assert open_source(tmp_path / "data", task=str(touch)).warnings == ()
+    assert open_source(tmp_path / "data", task=touch).warnings == ()
     assert main(["eval", "--policy.type=expert", f"--task.type={touch}", "--eval.n_episodes=2", "--eval.films=0",
                  "--output_dir=e", "--workers=1"]) == 0  # fmt: skip
     capsys.readouterr()
@@ -199,7 +199,7 @@ def test_a_bug_in_a_task_names_its_file_line_and_function(workers, tmp_path, cap
 
 
 def test_a_package_brings_names(touch, monkeypatch):
-    cls = type(get_task(str(touch)))
+    cls = type(get_task(touch))
 
     class Entry:
         name, value = "touch", "my_lab.touch:Touch"
@@ -213,7 +213,7 @@ def test_a_package_brings_names(touch, monkeypatch):
     with pytest.raises(UnknownName, match="the path of a Python file"):
         get_task("tuch")
     with pytest.raises(UsageError, match="does not exist"):
-        get_task("tuch.py")
+        get_task(Path("tuch.py"))
 
 
 def test_a_package_brings_robots_or_is_refused_in_one_line(monkeypatch):

@@ -19,6 +19,7 @@ import numpy as np
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError, shorten
 from manip_il.mdp import F64
+from manip_il.option import NameOrPath
 
 FEATURES = (
     "length",  # 1
@@ -177,23 +178,23 @@ class Reward:
         return cls(tuple(weights.get(name, 0.0) for name in FEATURES))
 
     @classmethod
-    def parse(cls, text: str) -> Reward:
-        """Return the reward that a text describes: the name of a shipped one, a `reward.json`, or `NAME=NUMBER,...`.
+    def parse(cls, text: NameOrPath) -> Reward:
+        """Return the reward that a text describes: the name of a shipped one, or `NAME=NUMBER,...`.
 
-        Only the lists `names` and `weights` of a file are read. Raises `UsageError` for anything else.
+        A `Path` is a `reward.json`, whose lists `names` and `weights` are read. Raises `UsageError` for anything else.
         """
-        if text in TASTES:
-            return TASTES[text]
+        if (shipped := TASTES.get(str(text))) is not None:
+            return shipped
         try:
-            if text.endswith(".json"):
-                tree = checks.read_json(Path(text), "a reward: names and weights")
+            if isinstance(text, Path):
+                tree = checks.read_json(text, "a reward: names and weights")
                 pairs = list(zip(tree["names"], tree["weights"], strict=True))
             else:
                 pairs = [word.split("=") for word in text.split(",")]
             weights = {str(name).strip(): float(weight) for name, weight in pairs}
         except (ManipError, LookupError, TypeError, ValueError) as error:
             expected = f"{', '.join(TASTES)}, reward.json with names and weights, or NAME=NUMBER,..."
-            raise UsageError(f"reward is {shorten(text)}: {checks.one_line(error)}; expected {expected}") from None
+            raise UsageError(f"reward is {shorten(str(text))}: {checks.one_line(error)}; expected {expected}") from None
         return cls.of(weights)
 
     @property

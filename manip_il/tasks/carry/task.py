@@ -16,6 +16,7 @@ import numpy as np
 
 from manip_il.errors import UsageError
 from manip_il.mdp import F64
+from manip_il.option import NameOrPath
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.shape import CUBE, Shape
@@ -131,8 +132,8 @@ class Carry(PickPlace):
         """Return the task with another object."""
         return replace(super().with_shape(shape), limits=Limits(horizon=200 if shape == CUBE else 300))
 
-    def with_argument(self, text: str) -> Self:
-        """Return the task with the reward that a text describes; the task's name lists its nonzero weights."""
+    def with_argument(self, text: NameOrPath) -> Self:
+        """Return the task with the reward that a text or a file describes; its name lists the nonzero weights."""
         reward = Reward.parse(text)
         return replace(self, name=NAME if reward == TASTES[DEFAULT] else f"{NAME}:{reward.numbers}", reward=reward)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from manip_il.caching import cached_per_thread
 from manip_il.errors import UsageError
+from manip_il.option import NameOrPath
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CAMERAS, CameraConfig, require_cameras
 from manip_il.tasks.stock.aloha.environment import AlohaEnv
@@ -19,7 +20,7 @@ StockLabeller = StockExpert | AlohaExpert
 
 
 def make_stock(
-    robot: str, task: str, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
+    robot: NameOrPath, task: NameOrPath, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
 ) -> StockEnvironment:
     """Make a stock environment. Raises `UsageError` for a camera that it lacks, or a condition that has ranges."""
     check_cameras(robot, cameras)
@@ -28,15 +29,15 @@ def make_stock(
             f"{robot} runs unmodified, without {', '.join(changed)}; use --suite=nominal, or --disturbed_share=0 for "
             "manip-il dagger"
         )
-    return AlohaEnv(task, cameras) if robot == ALOHA else StockEnv(task)
+    return AlohaEnv(str(task), cameras) if robot == ALOHA else StockEnv(str(task))
 
 
-def make_stock_expert(robot: str, task: str) -> StockLabeller:
+def make_stock_expert(robot: NameOrPath, task: NameOrPath) -> StockLabeller:
     """Make the expert of a stock task."""
-    return AlohaExpert(task) if robot == ALOHA else StockExpert(task)
+    return AlohaExpert(str(task)) if robot == ALOHA else StockExpert(str(task))
 
 
-def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
+def check_cameras(robot: NameOrPath, cameras: CameraConfig | None) -> None:
     """Raise `UsageError` for cameras that a robot, stock or not, does not have."""
     known = ROBOTS[robot].cameras if robot in ROBOTS else CAMERAS
     if cameras is not None and not known:
@@ -45,6 +46,6 @@ def check_cameras(robot: str, cameras: CameraConfig | None) -> None:
 
 
 @cached_per_thread()
-def described_stock(robot: str, task: str) -> StockEnvironment:
+def described_stock(robot: NameOrPath, task: NameOrPath) -> StockEnvironment:
     """Return an environment, cached for this thread, to read names and sizes from; no episode runs in it."""
     return make_stock(robot, task)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from manip_il.option import NameOrPath
 from manip_il.sim.config import OTHERS
 
 ROBOT = "fetch_stock"
@@ -142,7 +143,7 @@ class StockRobot:
     ends_solved: bool = field(default=False, kw_only=True)
 
 
-ROBOTS = {
+ROBOTS: dict[NameOrPath, StockRobot] = {
     ROBOT: StockRobot(
         STOCK,
         STATE_NAMES,
