@@ -19,7 +19,6 @@ import argparse
 import json
 import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,14 +26,13 @@ from _machine import describe_machine
 
 from manip_il.cli.main import main as manip_il
 from manip_il.data import schema
-from manip_il.data.dataset import Dataset
-from manip_il.data.lerobot_write import write_dataset
+from manip_il.data.build import merge_datasets, rewrite_columns
+from manip_il.data.dataset import Dataset, Own, StoredEpisode
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.reward import LearnedReward
 from manip_il.learn.training_state import PRETRAINED_MODEL
-from manip_il.mdp import Episode
 from manip_il.preferences.fitting import TIE, true_difference
 from manip_il.preferences.frames import find_datasets
 from manip_il.preferences.pairs import choose_pairs
@@ -128,18 +126,19 @@ def fresh_agreement(rounds: Path, reward: Path, count: int) -> Proportion:
 
 def join(good: Path, bad: Path, target: Path) -> None:
     """Write the episodes of two datasets as one, labelled with the executed actions, the only ones a recorder knows."""
-    spec, episodes = Dataset.open(good).spec, [[*Dataset.open(root).read_episodes()] for root in (good, bad)]
-    count = min(map(len, episodes))
-    fitted = (as_recorded(one) for group in episodes for one in group[:count])
-    write_dataset(fitted, target, spec, repo_id="a/half", fingerprint=Dataset.open(good).fingerprint)
+    datasets, made = [*map(Dataset.open, (good, bad))], [target.with_name(name) for name in ("half_good", "half_bad")]
+    for dataset, part in zip(datasets, made, strict=True):
+        own = Own(dataset.spec, dataset.fingerprint, dataset.provenance)
+        rewrite_columns(dataset, part, map(as_recorded, dataset.stored_episodes()), own, dataset.stored_features)
+    first, second = (dataset.info.episodes for dataset in datasets)
+    count = min(first, second)
+    merge_datasets(made, target, [f"0:{count}", f"{first}:{first + count}"], repo_id="a/half")
 
 
-def as_recorded(episode: Episode) -> Episode:
-    """Return the episode with the executed actions as labels."""
-    columns = dict(episode.columns)
-    columns[schema.ACTION] = columns[schema.EXECUTED_ACTION]
-    columns[schema.LABEL_VALID] = np.ones_like(columns[schema.LABEL_VALID])
-    return replace(episode, columns=columns)
+def as_recorded(episode: StoredEpisode) -> dict[str, np.ndarray]:
+    """Return the executed actions as labels."""
+    action = episode.columns[schema.EXECUTED_ACTION]
+    return {schema.ACTION: action, schema.LABEL_VALID: np.ones(len(action), np.int64)}
 
 
 def run(line: str, output: Path) -> None:

@@ -93,7 +93,7 @@ def make_dataset(root: Path, episodes: int = 20, length: int = 100, n: int = 8, 
     joints, things = tuple(f"joint_{i}" for i in range(n)), tuple(f"number_{i}" for i in range(k))
     spec = RobotTaskSpec("benchmark", "benchmark", 25, joints, things, 1, "benchmark")
     columns = {key: value for key, value in features(spec).items() if key in LEARNING}
-    dataset = LeRobotDataset.create("manip/benchmark", spec.fps, columns, root=root, use_videos=False)
+    dataset = LeRobotDataset.create("manip/benchmark", int(spec.fps), columns, root=root, use_videos=False)
     for _ in range(episodes):
         for _ in range(length):
             state = rng.normal(size=n).astype(np.float32)

@@ -86,7 +86,7 @@ def ours(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode]) -> None:
 def peer_default(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode], streaming: bool = False) -> None:
     dataset = LeRobotDataset.create(
         REPO,
-        spec.fps,
+        int(spec.fps),
         s.features(spec),
         root=root,
         robot_type=spec.robot,

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il.checks import parse_yaml
+from manip_il.checks import parse_yaml, shorten
 from manip_il.cli.common_options import SMALL, Pictured, Varied
 from manip_il.cli.options import Given, given
 from manip_il.cli.outputs import Replacing, require_writable
 from manip_il.cli.progress import progress, say, warn
 from manip_il.data.atomic import exclusive
 from manip_il.data.ownership import DATASET
+from manip_il.errors import UsageError
 from manip_il.evaluation.suites import varied
 from manip_il.option import NameOrPath, Seeded, option
 from manip_il.sim.config import CameraConfig, Look
@@ -22,6 +23,7 @@ from manip_il.sim.config import CameraConfig, Look
 if TYPE_CHECKING:
     from manip_il.collect.edits import EditSource, EditTarget
 
+_EXAMPLE = '{"observation.images.top": "observation.images.front"}'
 _RUN = "dataset"  # folder of a DAgger run with the states of all rounds
 
 
@@ -52,8 +54,11 @@ class RenameMap(dict[str, str]):
 
     @classmethod
     def parse(cls, text: str) -> RenameMap:
-        """Read JSON, as for LeRobot's `--rename_map`. Raises `ValueError` if it is something else."""
-        return cls({str(old): str(new) for old, new in dict(parse_yaml(text)).items()})
+        """Read JSON, as for LeRobot's `--rename_map`. Raises `UsageError` if it is something else."""
+        with suppress(ValueError):
+            if isinstance(found := parse_yaml(text), dict):
+                return cls({str(old): str(new) for old, new in found.items()})
+        raise UsageError(f"--rename_map is {shorten(text)}; expected {_EXAMPLE}")
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class MergeOptions(Replacing):
     )
     renamed: RenameMap = option(
         RenameMap,
-        'new names of cameras: {"observation.images.top": "observation.images.front"}',
+        f"new names of cameras: {_EXAMPLE}",
         flag="rename_map",
     )
 

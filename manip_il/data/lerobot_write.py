@@ -23,7 +23,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder
 from manip_il.data.camera import decode_picture
 from manip_il.data.dataset import Own, StoredEpisode
-from manip_il.data.info import PICTURES, Info, read_info
+from manip_il.data.info import PICTURES, Info, read_info, reading
 from manip_il.data.ownership import DATASET
 from manip_il.data.parquet_files import Column, ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, features, ordered_columns
@@ -157,22 +157,7 @@ class TableWriter:
             cut: Copy only the episode's part of a film.
         """
         numbers = np.array([self._tasks.setdefault(text, len(self._tasks)) for text in tasks], np.int64)
-        given = {**self._index_columns(numbers), **columns}
-        columns = {key: given[key] for key in self.features if key in given}
-        statistics = dict(stored.picture_statistics) if stored else {}
-        plain: dict[str, NDArray[Any]] = {}
-        for key, values in columns.items():
-            if key in self.films and isinstance(values, pa.ChunkedArray):  # pictures of the data files
-                columns[key] = values = np.stack([decode_picture(cell["bytes"]) for cell in values.to_pylist()])
-            if not isinstance(values, np.ndarray):
-                continue
-            if self.features[key]["dtype"] in PICTURES:
-                statistics[key] = picture_statistics(values)
-            elif self.features[key]["shape"] == (1,):
-                columns[key] = values = values.reshape(-1)
-            if key not in statistics and values.dtype.kind not in "OU":
-                plain[key] = values
-        statistics |= column_statistics(plain)
+        columns, statistics = self._fit({**self._index_columns(numbers), **columns}, stored)
         self._schema = self._schema or layout.data_schema(self.features, columns)
         chunk, file = self._data.write(to_table(columns, self._schema))
         row: dict[str, Any] = {
@@ -194,7 +179,6 @@ class TableWriter:
                 f"videos/{key}/from_timestamp": clip.first / self._fps,
                 f"videos/{key}/to_timestamp": (clip.first + clip.frames) / self._fps,
             }
-        statistics = {key: statistics[key] for key in self.features if key in statistics}
         for key, table in to_lists(statistics).items():
             row |= {f"stats/{key}/{name}": values for name, values in table.items()}
         chunk, file = self._meta.next_place()
@@ -252,6 +236,27 @@ class TableWriter:
             layout.INDEX: frame + self.frames,
             layout.TASK_INDEX: tasks,
         }
+
+    def _fit(self, given: Mapping[str, Column], stored: StoredEpisode | None) -> tuple[dict[str, Column], Statistics]:
+        """Return an episode's columns in the order and shapes of the features, and their statistics."""
+        columns = {key: given[key] for key in self.features if key in given}
+        statistics = dict(stored.picture_statistics) if stored else {}
+        numbers: dict[str, NDArray[Any]] = {}
+        for key, values in columns.items():
+            if stored and key in self.films and isinstance(values, pa.ChunkedArray):  # PNGs become a film
+                with reading(stored.dataset.root):
+                    values = np.stack([decode_picture(cell["bytes"]) for cell in values.to_pylist()])
+                columns[key] = values
+            if not isinstance(values, np.ndarray):
+                continue
+            if self.features[key]["dtype"] in PICTURES:
+                statistics[key] = picture_statistics(values)
+                continue
+            columns[key] = values.reshape(-1) if self.features[key]["shape"] == (1,) else values
+            if values.dtype.kind not in "OU":
+                numbers[key] = columns[key]
+        statistics |= column_statistics(numbers)
+        return columns, {key: statistics[key] for key in self.features if key in statistics}
 
     def _write_rows(self) -> None:
         """Write the rows of meta/episodes that are still in memory."""

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
+from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
+from manip_il.doctor.examine import examine_folder
 from manip_il.mdp import Episode
 
-from ..pictures import episode_frames, read_episodes
+from ..pictures import episode_frames, read_episodes, write
 
 FRONT, SIDE = s.IMAGES + "front", s.IMAGES + "side"
 
@@ -47,3 +49,12 @@ def test_pictures_come_back_bit_for_bit(root, seen, pictured):
         for key, column in read.columns.items():
             np.testing.assert_array_equal(column.reshape(written.columns[key].shape), written.columns[key])
     np.testing.assert_array_equal(episode_frames(root, SIDE, 2), seen[2].columns[SIDE])
+
+
+def test_merged_with_films_they_become_films(root, seen, pictured, tmp_path):
+    films = write(seen, tmp_path / "films", replace(pictured, video=True))
+    for name, sources in (("a", [root, films]), ("b", [films, root])):
+        merge_datasets(sources, tmp_path / name, repo_id="local/both")
+        assert examine_folder(tmp_path / name) == []
+        frames = Dataset.open(films).frames(FRONT, np.arange(20))
+        np.testing.assert_array_equal(Dataset.open(tmp_path / name).frames(FRONT, np.arange(40)), [*frames, *frames])

@@ -37,6 +37,7 @@ SMALL: Sizes = {  # put into every command that has the option
 }
 # Only where the line gives the option.
 GIVEN: Sizes = {"refit_steps": 1, "label_budget": 300, "replay": 4_000_001, "redraw": 30, "processes": 1,
+                "dataset.episodes": "0:2",
                 "image.height": 96, "image.width": 96}  # fmt: skip
 OF_COMMAND: dict[str, Sizes] = {
     "dagger": {"image.height": 32, "image.width": 32},
