@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, override
 
-from fsspec.callbacks import Callback, TqdmCallback
+from fsspec.callbacks import Callback
 
 from manip_il.store.errors import RemoteError
 
@@ -33,16 +32,3 @@ class Arrival(Callback):
     def update(self, count: float | None = 1) -> None:
         """Count more bytes."""
         self.relative_update(int(count or 0))
-
-
-class Arrivals(TqdmCallback):
-    """A progress bar of files, each with its own `Arrival`. sizes: of each file [bytes], by its path on the remote."""
-
-    def __init__(self, sizes: Mapping[str, int], bar: dict[str, Any]):
-        super().__init__(bar)
-        self._sizes = sizes
-
-    @override
-    def branched(self, path_1: Any, path_2: Any, **kwargs: Any) -> Arrival:
-        """Return the callback of one file."""
-        return Arrival(self._sizes[path_1])

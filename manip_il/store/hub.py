@@ -8,10 +8,8 @@ and hash of each file of a commit; a manifest lists those that a push wrote, sin
 from __future__ import annotations
 
 import re
-import shutil
 import tempfile
 from collections.abc import Collection, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,6 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, Re
 from huggingface_hub.errors import RemoteEntryNotFoundError, RepositoryNotFoundError, RevisionNotFoundError
 from huggingface_hub.utils import disable_progress_bars
 from huggingface_hub.utils._http import default_client_factory
-from tqdm import tqdm
 
 from manip_il import checks
 from manip_il.data.lerobot_layout import VERSION
@@ -34,7 +31,6 @@ _ADDRESS = re.compile(r"(datasets/|models/)?((?!datasets/|models/)\w[\w.-]*/\w[\
 _HIDDEN = re.compile(r"(.*/)?\.[^./]")  # such as the Hub's own .gitattributes
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _OF_A_DATASET = ("data/", "meta/", "videos/")  # the layout's folders, which are replaced as one
-_AT_ONCE = 8  # concurrent files
 
 
 def _guard_token(request: httpx.Request) -> None:
@@ -59,6 +55,8 @@ def _client() -> httpx.Client:
 class Hub:
     """A repository at a branch, tag or commit. quiet: show no progress bars."""
 
+    at_once = 8  # concurrent files
+
     def __init__(self, address: str, revision: str | None = None, *, private: bool = False, quiet: bool = False):
         """address: the part after `hf://`. Raises `UsageError` if it is invalid."""
         found = _ADDRESS.fullmatch(address)
@@ -70,7 +68,7 @@ class Hub:
         self._repo: Any = {"repo_id": self._place, "repo_type": "dataset" if self.kind == "dataset" else "model"}
         self.name = f"hf://{found[1] or ''}{self._place}{f'@{self._revision}' if self._revision else ''}"
         _use_client()
-        self._api, self._quiet = HfApi(library_name="manip_il"), quiet
+        self._api, self.quiet = HfApi(library_name="manip_il"), quiet
         if quiet:
             disable_progress_bars()
 
@@ -87,7 +85,7 @@ class Hub:
                 raise RemoteError(f"{self.name} has {found}; is HF_ENDPOINT a Hub?")
             tree = self._api.list_repo_tree(**self._repo, revision=head, recursive=True)
             listed = {one.path: one for one in tree if isinstance(one, RepoFile)}
-            missing = sorted({one.rfilename for one in about.siblings or ()} - listed.keys())
+            missing = sorted({one.rfilename for one in getattr(about, "siblings", None) or ()} - listed.keys())
             if missing:
                 text = f"its list of files lacks {checks.shorten(missing[0])}, which the commit has; try again"
                 raise RemoteError(f"{self.name}: {text}")
@@ -107,14 +105,15 @@ class Hub:
         """
         with tempfile.TemporaryDirectory(prefix="manip_il_manifest_") as folder, explained(f"read {self.name}"):
             try:
-                path = self._download(MANIFEST_FILE, before.version, Path(folder), checks.LARGEST_READ)
+                self.download(before, Path(folder), MANIFEST_FILE)
             except RemoteEntryNotFoundError:
                 named = _OF_A_DATASET if self.kind == "dataset" else ()
                 return {path: file for path, file in before.files.items() if path.startswith(named)}
-            pushed = dict(Manifest.from_json(checks.read_bytes(path, "a manifest"), before.version).files)
-            if (there := before.files.get(CARD)) and CARD in pushed:
-                card = self._download(CARD, before.version, Path(folder), there.size)
-                if not pushed[CARD].fits(card):
+            content = checks.read_bytes(Path(folder, MANIFEST_FILE), "a manifest")
+            pushed = dict(Manifest.from_json(content, before.version).files)
+            if CARD in pushed.keys() & before.files.keys():
+                self.download(before, Path(folder), CARD)
+                if not pushed[CARD].fits(Path(folder, CARD)):
                     del pushed[CARD]
             return pushed
 
@@ -154,20 +153,12 @@ class Hub:
             if self.kind == "dataset" and self._revision in (None, "main"):
                 self._move_tag()
 
-    def fetch(self, manifest: Manifest, folder: Path) -> None:
-        """Download a version's files into `folder`, without checking hashes."""
-        files, version = manifest.files, manifest.version
-        with explained(f"pull from {self.name}"), ThreadPoolExecutor(_AT_ONCE) as pool:
-            arrived = pool.map(lambda path: self._download(path, version, folder, files[path].size), files)
-            list(tqdm(arrived, "pull", len(files), unit=" files", disable=True if self._quiet else None))
-        shutil.rmtree(folder / ".cache")  # the library's records of the download
-
-    def _download(self, path: str, version: str, folder: Path, most: int) -> Path:
-        """Download a file of at most so many bytes to the same path in a folder; return where it is."""
-        where: Any = {**self._repo, "revision": version, "local_dir": folder}
-        bounded: Any = Arrival(most)
+    def download(self, manifest: Manifest, folder: Path, path: str) -> None:
+        """Download a file of a version to the same path in a folder, without checking its hash."""
+        where: Any = {**self._repo, "revision": manifest.version, "local_dir": folder}
+        file = manifest.files.get(path)
+        bounded: Any = Arrival(file.size if file else checks.LARGEST_READ)
         self._api.hf_hub_download(filename=path, force_download=True, tqdm_class=bounded, **where)
-        return folder / path
 
     def _create(self) -> Manifest:
         """Create the repository and the branch; return the branch's content: empty, or as on the main branch."""

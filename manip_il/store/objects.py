@@ -30,7 +30,7 @@ from fsspec.implementations.sftp import SFTPFileSystem
 
 from manip_il import checks
 from manip_il.errors import UnknownName, UsageError
-from manip_il.store.arrival import Arrival, Arrivals
+from manip_il.store.arrival import Arrival
 from manip_il.store.errors import RemoteError, explained
 from manip_il.store.manifest import MANIFEST_FILE, File, Kind, Manifest, PushPlan
 
@@ -41,8 +41,8 @@ _OPTIONS: dict[str, dict[str, Any]] = {"file": {"auto_mkdir": True}, "s3": _S3, 
 _SFTP = re.compile(
     r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)(:[1-5]?\d{1,4}|:6[0-4]\d{3}|:65[0-4]\d{2}|:655[0-2]\d|:6553[0-5])?/[^@]+"
 )
-_AT_ONCE, _SMALL_AT_ONCE = 4, 10  # concurrent files; s3fs keeps parts of large ones in memory, and has ten connections
-_SMALL = 10_000_000  # limit of a small file [bytes]
+_AT_ONCE, _LARGE_AT_ONCE = 10, 4  # concurrent files; s3fs has ten connections, and keeps parts of large ones in memory
+_LARGE = 10_000_000  # [bytes]
 _CHUNK = 2**20  # [bytes]
 
 
@@ -110,7 +110,7 @@ class Objects:
 
     def __init__(self, scheme: str, url: str, *, quiet: bool = False):
         """Raises `UsageError` for an unknown scheme, one whose package is not installed, or an invalid address."""
-        self._scheme, self._quiet = scheme, quiet
+        self._scheme, self.quiet = scheme, quiet
         self.name = re.sub(r"(?<=://)([^/@:]*):.*@", r"\1@", url)
         try:
             own = {"file": Local, "sftp": Sftp}
@@ -123,6 +123,7 @@ class Objects:
         if scheme == "sftp" and not _SFTP.fullmatch(url):
             text = "expected sftp://[USER@]HOST[:PORT]/FOLDER; in a password write / as %2F, @ as %40, : as %3A"
             raise UsageError(f"the sftp:// address is invalid; {text}")
+        self.at_once = _AT_ONCE if self._class.async_impl else 1
         self._login, place = self._class._get_kwargs_from_urls(url), self._class._strip_protocol(url)
         self._root = place.removeprefix("/~/").rstrip("/")  # relative to the user's home
         self._manifest = f"{self._root}/{MANIFEST_FILE}"
@@ -157,8 +158,9 @@ class Objects:
             files, before = plan.manifest.files, plan.before.files if plan.before else {}
             missing = {one.sha256: path for path, one in files.items() if there.get(one.sha256) != one.size}
             sources = [str(plan.local[path]) for path in missing.values()]
-            at_once = self._at_once(max([files[path].size for path in missing.values()], default=0))
-            bar = TqdmCallback(self._bar("push"))
+            bar = TqdmCallback({"desc": "push", "unit": " files", "disable": True if self.quiet else None})
+            is_large = max([files[path].size for path in missing.values()], default=0) > _LARGE
+            at_once = {"batch_size": _LARGE_AT_ONCE if is_large else self.at_once} if self._fs.async_impl else {}
             self._fs.put(sources, [self._object(key) for key in missing], callback=bar, **at_once)
             for path in missing.values():
                 if plan.local[path].stat().st_size != files[path].size:
@@ -172,22 +174,10 @@ class Objects:
                     if unused:
                         self._fs.rm([self._object(key) for key in unused])
 
-    def fetch(self, manifest: Manifest, folder: Path) -> None:
-        """Download objects to the paths of their files in a folder, without checking hashes."""
-        with explained(f"pull from {self.name}"):
-            sizes = {self._object(file.sha256): file.size for file in manifest.files.values()}
-            sources = [self._object(file.sha256) for file in manifest.files.values()]
-            targets = [str(folder / path) for path in manifest.files]
-            bar = Arrivals(sizes, self._bar("pull"))
-            self._fs.get(sources, targets, callback=bar, **self._at_once(max(sizes.values())))
-
-    def _bar(self, what: str) -> dict[str, Any]:
-        return {"desc": what, "unit": " files", "disable": True if self._quiet else None}
-
-    def _at_once(self, largest: int) -> dict[str, int]:
-        """Return the option of a transfer for the number of concurrent files."""
-        at_once = _SMALL_AT_ONCE if largest <= _SMALL else _AT_ONCE
-        return {"batch_size": at_once} if self._fs.async_impl else {}
+    def download(self, manifest: Manifest, folder: Path, path: str) -> None:
+        """Download the object of a file to the file's path in a folder, without checking its hash."""
+        file = manifest.files[path]
+        self._fs.get_file(self._object(file.sha256), str(folder / path), callback=Arrival(file.size))
 
     def _switch(self, new: Manifest, before: Manifest | None) -> None:
         """Replace the manifest if it still equals `before`: on S3 atomically, elsewhere after reading it once more."""

@@ -7,7 +7,10 @@ import shutil
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+
+from tqdm import tqdm
 
 from manip_il import checks
 from manip_il.data import atomic
@@ -17,7 +20,7 @@ from manip_il.data.ownership import DATASET, EPISODES, POLICY, kind_of, output_o
 from manip_il.doctor.examine import examine_folder
 from manip_il.doctor.finding import NotWhole, journals_of
 from manip_il.errors import UsageError
-from manip_il.store.errors import RemoteError
+from manip_il.store.errors import RemoteError, explained
 from manip_il.store.hub import Hub
 from manip_il.store.manifest import (
     CARD,
@@ -136,7 +139,10 @@ def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest) -> None:
     files = manifest.files
     for path in files:
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
-    remote.fetch(manifest, folder)
+    with explained(f"pull from {remote.name}"), ThreadPoolExecutor(remote.at_once) as pool:
+        arriving = pool.map(partial(remote.download, manifest, folder), files)
+        list(tqdm(arriving, "pull", len(files), unit=" files", disable=True if remote.quiet else None))
+    shutil.rmtree(folder / ".cache", ignore_errors=True)  # huggingface_hub's records of the download
     with ThreadPoolExecutor() as pool:
         fits = pool.map(lambda path: files[path].fits(folder / path), files)
         wrong = next((path for path, is_right in zip(files, fits, strict=True) if not is_right), None)

@@ -17,6 +17,7 @@ import torch
 from manip_il.cli.main import main
 from manip_il.data.json_lines import read_lines
 from manip_il.data.lerobot_layout import OURS
+from manip_il.data.ownership import UNFINISHED_MARK
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig
@@ -161,6 +162,8 @@ def test_a_half_written_checkpoint_is_passed_over(fit, tmp_path, weights):
     straight = weights(fit(name="a"))
     for stale in (".000002.partial/pretrained_model", "000002/pretrained_model"):
         (tmp_path / "b/checkpoints" / stale).mkdir(parents=True)
+    (tmp_path / "b/checkpoints/.000002.partial" / UNFINISHED_MARK).touch()
+    (tmp_path / "b/checkpoints/000002/pretrained_model/config.json").write_text('{"type": "mlp"}')
     after = weights(fit(name="b", resume=True))
     assert all(torch.equal(straight[key], after[key]) for key in after)
 
