@@ -41,8 +41,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {"file": {"auto_mkdir": True}, "s3": _S3, 
 _SFTP = re.compile(
     r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)(:[1-5]?\d{1,4}|:6[0-4]\d{3}|:65[0-4]\d{2}|:655[0-2]\d|:6553[0-5])?/[^@]+"
 )
-_AT_ONCE, _SMALL_AT_ONCE = 4, 10  # concurrent files; s3fs keeps parts of large ones in memory, and has ten connections
-_SMALL = 10_000_000  # limit of a small file [bytes]
+_AT_ONCE = 4  # concurrent files; s3fs keeps parts of large ones in memory
 _CHUNK = 2**20  # [bytes]
 
 
@@ -157,9 +156,8 @@ class Objects:
             files, before = plan.manifest.files, plan.before.files if plan.before else {}
             missing = {one.sha256: path for path, one in files.items() if there.get(one.sha256) != one.size}
             sources = [str(plan.local[path]) for path in missing.values()]
-            at_once = self._at_once(max([files[path].size for path in missing.values()], default=0))
             bar = TqdmCallback(self._bar("push"))
-            self._fs.put(sources, [self._object(key) for key in missing], callback=bar, **at_once)
+            self._fs.put(sources, [self._object(key) for key in missing], callback=bar, **self._at_once)
             for path in missing.values():
                 if plan.local[path].stat().st_size != files[path].size:
                     raise RemoteError(f"{plan.local[path]} was modified during the push; push again")
@@ -179,15 +177,15 @@ class Objects:
             sources = [self._object(file.sha256) for file in manifest.files.values()]
             targets = [str(folder / path) for path in manifest.files]
             bar = Arrivals(sizes, self._bar("pull"))
-            self._fs.get(sources, targets, callback=bar, **self._at_once(max(sizes.values())))
+            self._fs.get(sources, targets, callback=bar, **self._at_once)
 
     def _bar(self, what: str) -> dict[str, Any]:
         return {"desc": what, "unit": " files", "disable": True if self._quiet else None}
 
-    def _at_once(self, largest: int) -> dict[str, int]:
-        """Return the option of a transfer for the number of concurrent files."""
-        at_once = _SMALL_AT_ONCE if largest <= _SMALL else _AT_ONCE
-        return {"batch_size": at_once} if self._fs.async_impl else {}
+    @property
+    def _at_once(self) -> dict[str, int]:
+        """The option of a transfer for the number of concurrent files."""
+        return {"batch_size": _AT_ONCE} if self._fs.async_impl else {}
 
     def _switch(self, new: Manifest, before: Manifest | None) -> None:
         """Replace the manifest if it still equals `before`: on S3 atomically, elsewhere after reading it once more."""
