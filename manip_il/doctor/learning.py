@@ -111,7 +111,7 @@ def _check_joints(dataset: Dataset, rows: Rows, told: F64, found: F64, names: ND
     agree = np.array([_correlate(told[span], found[span]) for span in rows.values()])
     against = (agree < -0.8) & (np.median(agree, axis=0) > 0.8)
     for place, name in enumerate(names if len(rows) >= _LEAST else ()):
-        apart = _find_apart(starts[:, place], 5, 0.1 * np.ptp(found[:, place]))
+        apart = _find_apart(starts[:, place], 0.1 * np.ptp(found[:, place]))
         measures = (("starts at", starts, apart), ("correlates with its action by", agree, against[:, place]))
         for what, values, odd in measures:
             if odd.any():
@@ -120,13 +120,13 @@ def _check_joints(dataset: Dataset, rows: Rows, told: F64, found: F64, names: ND
                 yield of_episodes(dataset.root, s.STATE, text, np.array([*rows])[odd])
 
 
-def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
-    """Return which values (E,) are outliers: beyond a gap wider than `least` and `times` the range of either side."""
+def _find_apart(values: F64, least: float) -> Mask:
+    """Return which values (E,) are outliers: beyond a gap wider than `least` and 5 times the range of either side."""
     ranked = np.sort(values)
     cut = int(np.argmax(np.diff(ranked)))
     gap, extent = ranked[cut + 1] - ranked[cut], max(ranked[cut] - ranked[0], ranked[-1] - ranked[cut + 1])
     above = values > ranked[cut]
-    return (above if 2 * above.sum() <= len(values) else ~above) & (gap > max(times * extent, least))
+    return (above if 2 * above.sum() <= len(values) else ~above) & (gap > max(5 * extent, least))
 
 
 def _check_commands(rows: Rows, action: F64, state: F64, names: NDArray[np.str_], arm: Mask) -> Iterator[Finding]:

@@ -78,9 +78,8 @@ def test_labels_are_the_experts_and_an_episode_depends_on_its_seed_alone(job: Ro
         assert labelled(episode).any()
         is_the_experts(episode)
         for part in parts(episode):
-            columns = part.columns
             wanted = {"seed": episode.seed, "round": job.round, "beta": job.driver.beta}
-            assert {key: set(columns[key]) for key in wanted} == {key: {one} for key, one in wanted.items()}
+            assert {key: {*part.columns[key].flat} for key in wanted} == {key: {one} for key, one in wanted.items()}
     bits = written(together.values())
     assert len({columns["executed_action"] for columns in bits.values()}) == len(SEEDS)
     assert written(job.run(SEEDS[2:3])) == {SEEDS[2]: bits[SEEDS[2]]}
