@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -103,7 +104,7 @@ def read_episodes(root: Path) -> Iterator[Episode]:
     for one in dataset.stored_episodes(names):
         columns = {key: dataset.frames(key, dataset.rows_of(one.number)) for key in dataset.spec.image_keys}
         columns |= {key: one.columns[key].reshape(-1, *shapes[key]) for key in names}
-        solved, drawn = columns[s.SUCCESS], dataset.episodes.drawn.get(one.number, {})
+        solved, drawn = columns[s.SUCCESS], json.loads(one.others[lerobot_layout.DRAWN] or "{}")
         ends = bool(solved.any()), bool(solved[-1])
         yield Episode(int(columns[s.SEED][0, 0]), {key: columns[key] for key in shapes}, *ends, one.tasks[0], drawn)
 

@@ -8,7 +8,7 @@ import itertools
 import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +64,7 @@ class Recording:
         if not path.is_file():
             return cls(local_id(journals.absolute().name.removesuffix(".journals") or "journals"))
         with reading(path):
-            data = checks.read_json(path, "the settings of a recording")
-            return cls(**{one.name: data[one.name] for one in fields(cls) if one.name in data})
+            return cls(**checks.read_json(path, "the settings of a recording"))
 
     def make(self, rollouts: Rollouts, root: Path, *, replace: bool = False) -> tuple[Info, int]:
         """Write rollouts as a dataset; return its info and the number of failed episodes left out.

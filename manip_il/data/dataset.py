@@ -193,13 +193,7 @@ class Dataset:
         """
         if names is None:
             names = [feature.key for feature in self.info.of_dtype(*NUMBERS)]
-        pieces = list(self.pieces(names))
-        if len(pieces) == 1:
-            return pieces[0]
-        return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
-
-    def pieces(self, names: Sequence[str]) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield the columns, (T,) or (T, d), of each data file. Raises what `columns` raises."""
+        pieces: list[dict[str, NDArray[Any]]] = []
         known = [key for key, feature in self.features.items() if feature.dtype not in PICTURES]
         for name in names:
             if name not in known:
@@ -207,8 +201,8 @@ class Dataset:
         for path in self.data_files:
             with reading(path):
                 table = read_file(path, names)
-                piece = {name: to_numpy(table.column(name), self.features[name]) for name in names}
-            yield piece
+                pieces.append({name: to_numpy(table.column(name), self.features[name]) for name in names})
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
     def camera(self, key: str) -> Camera:
         """Return a camera's pictures, not yet decoded. Raises what `Camera.of` raises."""
@@ -302,13 +296,12 @@ def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDA
     Raises what `Dataset.columns` raises.
     """
     pieces: list[dict[str, NDArray[Any]]] = []
-    before = {layout.EPISODE_INDEX: 0, layout.INDEX: 0}
+    episodes = frames = 0
     for dataset in map(Dataset.open, roots):
-        for piece in dataset.pieces(names):
-            pieces.append({name: values + before[name] if name in before else values for name, values in piece.items()})
-        before = {
-            layout.EPISODE_INDEX: before[layout.EPISODE_INDEX] + dataset.info.episodes,
-            layout.INDEX: before[layout.INDEX] + len(dataset),
-        }
+        before = {layout.EPISODE_INDEX: episodes, layout.INDEX: frames}
+        columns = dataset.columns(names)
+        columns |= {name: columns[name] + first for name, first in before.items() if name in columns}
+        pieces.append(columns)
+        episodes, frames = episodes + dataset.info.episodes, frames + len(dataset)
     shapes = {name: values.shape[1:] for name, values in pieces[0].items()}
     return {name: np.concatenate([one[name].reshape(-1, *shape) for one in pieces]) for name, shape in shapes.items()}

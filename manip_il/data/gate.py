@@ -31,23 +31,14 @@ _DAMAGES = (ManipError, OSError, ValueError, pa.ArrowException, av.FFmpegError, 
 _BATCH = 64  # rows in memory at once
 
 
-def check_arrived(root: Path, *, strict: bool = True) -> None:
-    """Open every file of a dataset in a child process. Raises `ManipError` naming a file that is refused.
-
-    strict: refuse damaged files, too; otherwise refuse only files that are not regular, or that crash the process or
-    need too much memory or time.
-    """
-    checks.in_child(str(root), open_files, root, strict)
+def check_arrived(root: Path) -> None:
+    """Open every file of a dataset in a child process. Raises `ManipError` naming a file that is refused."""
+    checks.in_child(str(root), open_files, root)
 
 
-def open_files(root: Path, strict: bool = True) -> None:
+def open_files(root: Path) -> None:
     """Open every file of a dataset, in the child process. Raises `ManipError` as `check_arrived` does."""
-    features: Mapping[str, Feature] = {}
-    try:
-        features = read_info(root).features
-    except ManipError:
-        if strict:
-            raise
+    features = read_info(root).features
     for path in sorted(path for path in root.rglob("*") if not path.is_dir()):
         if not path.is_file():
             raise ManipError(
@@ -57,9 +48,8 @@ def open_files(root: Path, strict: bool = True) -> None:
         try:
             _open_file(path, path.relative_to(root).parts[0], features)
         except _DAMAGES as error:
-            if strict:
-                reason = getattr(error, "strerror", None) or checks.one_line(error)
-                raise ManipError(reason if str(path) in reason else f"{path}: {reason}") from error
+            reason = getattr(error, "strerror", None) or checks.one_line(error)
+            raise ManipError(reason if str(path) in reason else f"{path}: {reason}") from error
 
 
 def _open_file(path: Path, folder: str, features: Mapping[str, Feature]) -> None:

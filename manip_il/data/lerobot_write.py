@@ -26,11 +26,11 @@ from manip_il.data.dataset import Own, StoredEpisode
 from manip_il.data.info import PICTURES, Info, read_info, reading
 from manip_il.data.ownership import DATASET
 from manip_il.data.parquet_files import Column, ParquetFiles, to_table
-from manip_il.data.schema import RobotTaskSpec, features, ordered_columns
+from manip_il.data.schema import RobotTaskSpec, features
 from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, pool, to_lists
 from manip_il.data.video import CameraFiles
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 
 _GROUP_ROWS = 1_000  # frames per row group
@@ -55,15 +55,19 @@ def write_dataset(
     The dataset appears when it is complete. Episodes are taken one by one and not kept; the same ones in the same order
     give the same bytes, videos included. provenance: origin of the episodes, read after the last episode. replace:
     replace a dataset of ours; otherwise, if `root` is not empty, raises `FolderExistsError` before taking an episode.
-    Also raises what `ordered_columns` raises, and `ManipError` if there are no episodes or the disk is full.
+    Also raises `MismatchError` for an episode with other columns than `features(spec)`, and `ManipError` if there are
+    no episodes or the disk is full.
     """
     about = Own(spec, fingerprint, {} if provenance is None else provenance), repo_id
-    robot = spec.robot_type or spec.robot
-    with new_dataset(root, features(spec), spec.fps, robot, *about, video=video, replace=replace) as writer:
+    robot, table = spec.robot_type or spec.robot, features(spec)
+    with new_dataset(root, table, spec.fps, robot, *about, video=video, replace=replace) as writer:
         for episode in episodes:
+            columns = episode.columns
+            if table.keys() != columns.keys():
+                raise MismatchError("list of columns", f"seed {episode.seed}", [*columns], "the dataset", [*table])
             text = checks.text("instruction", episode.instruction or spec.instruction)
             drawn = {layout.DRAWN: json.dumps(dict(episode.drawn))}
-            writer.add_columns(ordered_columns(episode, spec), [text] * len(episode), drawn)
+            writer.add_columns(columns, [text] * len(episode), drawn)
     return read_info(root)
 
 

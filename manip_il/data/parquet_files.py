@@ -6,11 +6,10 @@ keeps the column, its split and delete drop it; the draws are also part of `sim_
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -185,7 +184,7 @@ class VideoSpans:
 
 @dataclass(frozen=True)
 class EpisodeTable:
-    """Columns with one entry per episode. start, stop: rows, stop excluded. drawn: random draws by episode index.
+    """Columns with one entry per episode. start, stop: rows, stop excluded.
 
     others: values in the columns that LeRobot does not have.
     """
@@ -196,8 +195,7 @@ class EpisodeTable:
     stop: I64
     tasks: list[list[str]]
     clips: dict[str, VideoSpans]  # by camera column
-    drawn: dict[int, dict[str, Any]] = field(default_factory=dict[int, dict[str, Any]])
-    others: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    others: list[dict[str, Any]]
 
     def __len__(self) -> int:
         return len(self.index)
@@ -226,22 +224,14 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
             ]
             return VideoSpans(files, table.column(f"videos/{key}/from_timestamp").to_numpy())
 
-        index, none = numbers(layout.EPISODE_INDEX), [None] * len(table)
-        drawn, tasks = (
-            table.column(name).to_pylist() if name in table.column_names else none for name in (layout.DRAWN, "tasks")
-        )
+        tasks = table.column("tasks").to_pylist() if "tasks" in table.column_names else [None] * len(table)
         return EpisodeTable(
-            index=index,
+            index=numbers(layout.EPISODE_INDEX),
             length=numbers("length"),
             start=numbers("dataset_from_index"),
             stop=numbers("dataset_to_index"),
             tasks=[texts or [] for texts in tasks],
             clips={feature.key: clips(feature.key) for feature in info.of_dtype("video")},
-            drawn={
-                number: checks.mapping(layout.DRAWN, json.loads(text))
-                for number, text in zip(index.tolist(), drawn, strict=True)
-                if text
-            },
             others=table.select([one for one in table.column_names if not _EPISODE_COLUMNS.fullmatch(one)]).to_pylist(),
         )
 

@@ -1,4 +1,4 @@
-"""The columns of a dataset: keys, dtypes and shapes (LeRobot v3.0), and checks that an episode fits them."""
+"""The columns of a dataset: keys, dtypes and shapes (LeRobot v3.0)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from fractions import Fraction
 from itertools import zip_longest
 from typing import Any
 
-from numpy.typing import NDArray
-
 from manip_il import checks
 from manip_il.errors import ManipError, MismatchError
-from manip_il.mdp import KEYPOINTS, Episode
+from manip_il.mdp import KEYPOINTS
 from manip_il.tasks.stock.table import TWO_ARMS
 
 STATE = "observation.state"
@@ -167,15 +165,3 @@ def check_same_spec(left_name: str, left: Any, right_name: str, right: RobotTask
                 ours, theirs = next(pair for pair in zip_longest(ours, theirs) if pair[0] != pair[1])
             none = OWN_OBJECT if what == "object" else "none"
             raise MismatchError(what, left_name, ours or none, right_name, theirs or none)
-
-
-def ordered_columns(episode: Episode, spec: RobotTaskSpec) -> dict[str, NDArray[Any]]:
-    """Return the episode's columns in the order of `features(spec)`.
-
-    (T, d) for numbers, uint8 (T, height, width, 3) for pictures. Raises `MismatchError` if the episode has other
-    columns.
-    """
-    table = features(spec)
-    if table.keys() != episode.columns.keys():
-        raise MismatchError("list of columns", f"seed {episode.seed}", [*episode.columns], "the dataset", [*table])
-    return {key: episode.columns[key] for key in table}

@@ -16,7 +16,6 @@ from manip_il import checks
 from manip_il.data.atomic import exclusive
 from manip_il.data.build import build
 from manip_il.data.dataset import Dataset
-from manip_il.data.gate import check_arrived
 from manip_il.data.info import NUMBERS
 from manip_il.data.lerobot_layout import DATA_FILES, EPISODE_INDEX, INFO, STATS, write_json
 from manip_il.data.parquet_files import count_rows
@@ -34,11 +33,10 @@ _PICTURES = 100  # pictures per camera from which statistics are computed
 def examine_folder(root: Path, more: Sequence[Check] = (), *, repaired: bool = False) -> list[Finding]:
     """Return all findings about a folder, [] for a sound dataset. Never raises.
 
-    Every file is first opened in a child process; if that needs too much memory or time, or the folder is not a
-    dataset, this is the only finding. more: additional checks. repaired: whether it has just been repaired.
+    If the folder is not a dataset, this is the only finding. more: additional checks. repaired: whether it has just
+    been repaired.
     """
     try:
-        check_arrived(root, strict=False)
         dataset = Dataset.open(root)
     except ManipError as problem:
         found = [_explain(root, problem)]

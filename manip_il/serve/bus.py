@@ -7,15 +7,11 @@ The checksum is the complement of the sum of all bytes from the id on. Present_P
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import logging
 import math
 import os
 import pty
 import select
-import termios
 import threading
-import time
 import tty
 from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
@@ -28,7 +24,6 @@ from scservo_sdk import scservo_def as protocol
 from manip_il.mdp import F64
 
 I64, U8 = NDArray[np.int64], NDArray[np.uint8]
-_LOG = logging.getLogger(__name__)
 _MODEL = "sts3215"
 _TABLE, _SIGNS = tables.MODEL_CONTROL_TABLE[_MODEL], tables.MODEL_ENCODING_TABLE[_MODEL]
 STEPS: int = tables.MODEL_RESOLUTION[_MODEL]  # encoder steps per turn
@@ -39,7 +34,6 @@ _SIZE = 96  # readable bytes of a servo's memory
 _READ_ONLY = {*range(5), *range(56, 71)}
 _LONGEST = 250  # largest length byte of a packet
 _ID, _POSITION = (_TABLE[name][0] for name in ("ID", "Present_Position"))
-_BUSY = 0.25  # a program that has read within this time still uses the port [s]
 _KEPT = {  # registers kept without power, by key in LeRobot's calibration file
     "id": "ID",
     "homing_offset": "Homing_Offset",
@@ -81,7 +75,7 @@ class Bus:
         self.connected: Collection[int] = range(len(calibration))
         self.commands = 0
         self.on_read: Callable[[], None] = lambda: None
-        self._waiting, self._was_read = b"", -math.inf
+        self._waiting = b""
         self._master, self._slave = pty.openpty()  # keeping the other end open keeps the port alive between clients
         os.set_blocking(self._master, False)
         tty.setraw(self._master)
@@ -140,11 +134,6 @@ class Bus:
             if select.select([self._master], [], [], 0.1)[0]:
                 with contextlib.suppress(BlockingIOError):  # a client that reads no answers loses them
                     os.write(self._master, self.feed(os.read(self._master, 4096)))
-            fcntl.ioctl(self._slave, termios.TIOCEXCL if self._is_in_use else termios.TIOCNXCL)  # root may open it
-
-    @property
-    def _is_in_use(self) -> bool:
-        return time.monotonic() - self._was_read < _BUSY
 
     def feed(self, received: bytes) -> bytes:
         """Return the answers to all packets that these bytes complete; keep the rest for the next call.
@@ -173,14 +162,10 @@ class Bus:
     def _answer(self, number: int, instruction: int, parameters: bytes) -> bytes:
         here = {int(self.memory[one, _ID]): self.memory[one] for one in self.connected}
         if instruction == protocol.INST_PING:
-            if self._is_in_use:
-                _LOG.warning("%s is already in use by another program; a second one gets no answer", self.path)
-                return b""
             return b"".join(_packet(one) for one in here if number in (one, protocol.BROADCAST_ID))
         if instruction == protocol.INST_SYNC_READ and len(parameters) >= 2:
             address, size, *asked = parameters
             if address <= _POSITION < address + size and len(asked) > 1:
-                self._was_read = time.monotonic()
                 self.on_read()
             return b"".join(_packet(one, _part(here[one], address, size)) for one in asked if one in here)
         if instruction == protocol.INST_SYNC_WRITE and len(parameters) >= 2:

@@ -31,7 +31,7 @@ from manip_il.tasks.stock.table import ALOHA
 
 PICTURE = "assets/episodes.png"
 _FRAMES = 6  # per camera
-_OURS = (b"<!-- written by manip-il push -->", b"| made by | manip_il")  # a card with either is ours and is replaced
+_OURS = b"<!-- written by manip-il push -->"  # a card with this line is ours and is replaced
 _NOT_SHOWN = re.compile(  # lines of options that are paths, concern one machine, or may be secrets
     r"/|```|^ *(root|output_dir|repo_id|config_path|resume|overwrite|engine|device|workers|threads|num_workers|memory|"
     r"image_cache_gb|log_freq|save_freq|tensorboard):|(?i:token|secret|passw|credential|api_?key)"
@@ -47,7 +47,7 @@ def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, P
     if dataset and dataset.cameras:
         made[PICTURE] = folder / "episodes.png"
         draw_picture(dataset, made[PICTURE])
-    if not (root / CARD).is_file() or any(mark in checks.read_bytes(root / CARD, "a card") for mark in _OURS):
+    if not (root / CARD).is_file() or _OURS in checks.read_bytes(root / CARD, "a card"):
         environment = jinja2.Environment(finalize=_shown)
         environment.filters["word"] = lambda value: shlex.quote(_shown(str(value)))
         environment.filters["cell"] = lambda value: " ".join(str(value).split()).replace("|", "\\|")

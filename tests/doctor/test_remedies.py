@@ -66,7 +66,6 @@ def test_journals_that_hold_less_than_the_dataset_replace_nothing(ours):
     assert digests(ours) == before
 
 
-@pytest.mark.usefixtures("no_child")
 def test_counts_statistics_and_leftovers_are_mended_without_journals(theirs):
     whole = json.loads((theirs / layout.STATS).read_text())
     edit_json(theirs / layout.INFO, lambda info: info.update(total_frames=3, total_episodes=1))
@@ -94,7 +93,6 @@ def wrong_statistics(root: Path) -> list[str]:
     return [str(one) for one in examine_folder(root) if one.place.startswith(layout.STATS)]
 
 
-@pytest.mark.usefixtures("no_child")
 @pytest.mark.parametrize("mean", [2048, 10_000])
 def test_a_deviation_that_float32_lost_beside_a_large_mean_is_found_and_computed_again(theirs, mean):
     stats = shift(theirs, mean)
@@ -106,7 +104,6 @@ def test_a_deviation_that_float32_lost_beside_a_large_mean_is_found_and_computed
     assert json.loads((theirs / layout.STATS).read_text())[s.ACTION]["std"] == pytest.approx([0.3] * 5, rel=0.1)
 
 
-@pytest.mark.usefixtures("no_child")
 @pytest.mark.parametrize("mean", [0, 1.5, 90])
 def test_statistics_that_lerobot_computed_closely_enough_are_right(theirs, mean):
     stats = shift(theirs, mean)
@@ -124,7 +121,6 @@ def test_what_a_link_leads_to_is_not_changed(theirs):
     assert json.loads(elsewhere.read_text())["total_frames"] == 3
 
 
-@pytest.mark.usefixtures("no_child")
 def test_lerobots_tool_deletes_the_episodes_that_a_remedy_names(theirs, warm_lerobot: Warm):
     edit_table(theirs / DATA, lambda table: table[s.ACTION].__setitem__(4, [float("nan")] * 5))
     [finding] = [one for one in examine_folder(theirs) if "not finite" in one.text]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -109,28 +108,3 @@ def test_garbage_is_not_answered_and_what_follows_is(bus: Bus):
         found = b"".join(bus.feed(part) for part in (noise, wrong, half, asked * 4))
         assert found
         assert found == right * (len(found) // len(right))
-
-
-def test_a_program_that_opens_a_port_in_use_gets_no_answer(bus: Bus, caplog: pytest.LogCaptureFixture):
-    """In use is a port whose servos somebody asks where they are, as every program of LeRobot's does in its loop."""
-    assert bus.feed(packet(BROADCAST, SYNC_READ, 56, 2, 1, 2))
-    assert not bus.feed(packet(1, PING))
-    assert "another program" in caplog.text
-    time.sleep(0.3)
-    assert bus.feed(packet(1, PING)) == packet(1, 0)
-
-
-def test_only_root_can_open_a_port_in_use(bus: Bus, monkeypatch: pytest.MonkeyPatch):
-    """Opening it discards bytes that the program which uses it waits for."""
-    monkeypatch.setattr("manip_il.serve.bus._BUSY", 60.0)
-    opens, user = ["sh", "-c", f": <>{bus.path}"], "nobody" if os.geteuid() == 0 else None
-    bus.path.chmod(0o666)
-    client = os.open(bus.path, os.O_RDWR | os.O_NOCTTY)
-    os.write(client, packet(BROADCAST, SYNC_READ, 56, 2, 1, 2))
-    os.read(client, 1)
-    refused = subprocess.run(opens, user=user, stderr=subprocess.PIPE, text=True)
-    os.close(client)
-    assert "Device or resource busy" in refused.stderr
-    monkeypatch.setattr("manip_il.serve.bus._BUSY", 0.0)
-    time.sleep(1.0)
-    subprocess.run(opens, user=user, check=True)
