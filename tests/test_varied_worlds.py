@@ -27,10 +27,10 @@ from manip_il.sim.env import ManipEnv
 from manip_il.sim.shape import KINDS as SHAPES
 from manip_il.sim.variation import WORLD_SIZE, with_drawn
 from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.envs import env_of, make_env
+from manip_il.tasks.envs import env_of
 
 from .pictures import read_episodes
-from .tables import SCENES, every_task
+from .tables import SCENES
 
 KINDS = ("object", "view", "dynamics")
 REACH = make_config("panda", "reach", horizon=6, success_steps=1)
@@ -83,18 +83,6 @@ def test_pictures_of_restored_states_are_those_of_their_own_world(shape: str):
     np.testing.assert_array_equal(plain.observe().images["front"], seen["front"])
     plain.start(2)
     assert not np.array_equal(plain.observe().images["front"], seen["front"])
-
-
-@every_task
-def test_a_state_from_before_worlds_had_numbers_of_their_own_is_read_as_it_was(task: str):
-    env = make_env("panda", task)
-    env.start(3)
-    state = env.get_state()
-    older = State(state.physics, state.variation[:-WORLD_SIZE], state.step)
-    label = Expert(env.scene).label(older)
-    assert label.action.tobytes() == Expert(env.scene).label(state).action.tobytes()
-    env.set_state(State.from_vector(older.to_vector()))
-    assert env.get_state().to_vector().tobytes() == state.to_vector().tobytes()
 
 
 @pytest.fixture(scope="module", params=[("", KINDS), ("any", ("object",)), ("any", ())], ids=str)
