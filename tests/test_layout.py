@@ -1,5 +1,6 @@
 """The repository keeps its own rules: what no file may name, and what is named in several places."""
 
+import ast
 import re
 import subprocess
 import tomllib
@@ -57,3 +58,47 @@ def test_every_file_that_the_package_reads_is_installed_in_it():
 def test_the_image_and_make_bring_the_packages_that_errors_name():
     assert PACKAGES in (ROOT / "Dockerfile").read_text()
     assert f"({PACKAGES})" in (ROOT / ".ci" / "system").read_text()
+
+
+def calls(*names: str) -> set[tuple[str, str, str]]:
+    """File, function and callee of every call in the package of functions with these names, or methods `.names`."""
+    found = set[tuple[str, str, str]]()
+    for path in sorted((ROOT / "manip_il").rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+            for call in (node for node in ast.walk(function) if isinstance(node, ast.Call)):
+                name = ast.unparse(call.func)
+                literal = bool(call.args) and isinstance(call.args[0], ast.Constant)
+                if (name in names or f".{name.rpartition('.')[2]}" in names) and not literal:
+                    found.add((path.relative_to(ROOT / "manip_il").as_posix(), function.name, name))
+    return found
+
+
+def test_one_function_runs_a_users_file_and_one_place_calls_it():
+    files = (".exec_module", ".spec_from_file_location", ".run_path", ".run_module", "exec", "__import__", "execfile")
+    assert {(file, function) for file, function, _ in calls(*files)} == {("tasks/table.py", "_of_file")}
+    assert calls("_of_file") == {("tasks/table.py", "get_task", "_of_file")}
+
+
+def test_other_code_is_found_by_the_packages_own_tables_alone():
+    assert {(file, function) for file, function, _ in calls("import_module", ".import_module", "eval")} == {
+        ("__init__.py", "__getattr__"),
+        ("algorithms/run.py", "results"),
+        ("cli/main.py", "load"),
+        ("cli/options.py", "type_of"),
+        ("learn/lerobot_config.py", "policy_types"),
+        ("mcap/read.py", "read_messages"),
+        ("sim/render.py", "_context"),
+    }
+
+
+def test_a_text_becomes_a_path_only_where_a_person_typed_it():
+    assert {(file, function) for file, function, _ in calls("typed")} == {
+        ("cli/options.py", "decode"),
+        ("lerobot_plugin/environment.py", "_given"),
+        ("tasks/config.py", "make_config"),
+    }
+    assert {(file, function) for file, function, _ in calls("make_config")} == {
+        ("evaluation/robot_check.py", "check_robot"),  # of the robot on the command line
+        ("tasks/envs.py", "make_env"),
+    }

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import pytest
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
+from manip_il.errors import UnknownName, UsageError
 from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.lerobot_plugin.environment import TASKS
 from manip_il.tasks.config import make_config
@@ -61,3 +63,15 @@ def test_success_in_the_step_that_ends_an_episode_is_told_although_the_next_one_
     assert truncated.all()
     assert last["final_info"]["is_success"].tolist() == [True, True]
     assert not last["is_success"].any()
+
+
+def test_a_file_is_opened_only_if_the_command_line_names_it(tmp_path, monkeypatch):
+    own = tmp_path / "own.py"
+    own.write_text("from pathlib import Path\nPath(__file__).with_name('ran').touch()\n")
+    with pytest.raises(UnknownName, match=r"own\.py"):  # as from a checkpoint's `train_config.json`
+        ManipILEnv(task=str(own))
+    assert [one.name for one in tmp_path.iterdir()] == ["own.py"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--env.task={own}"])
+    with pytest.raises(UsageError, match=r"own\.py: none; expected exactly one class"):
+        ManipILEnv(task=str(own))
+    assert (tmp_path / "ran").is_file()

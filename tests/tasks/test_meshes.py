@@ -134,6 +134,7 @@ def test_a_dataset_and_an_evaluation_of_it_are_used_with_its_file(folder, tmp_pa
     mesh, few = text(folder, "bowl"), ["--workers=1", "--eval.n_episodes=2", "--eval.films=0", "--output_dir=e"]
     words = ["--dataset.num_episodes=2", "--dataset.root=data", "--workers=1"]
     assert main(["record", f"--task.object={mesh}", *words]) == 0
+    assert f"pick_place --task.object={mesh}" in capsys.readouterr().out
     assert main(["data", "check", "data"]) == 0
     with pytest.raises(ManipError, match=r"give --task\.object=mesh:PATH/bowl\.obj"):
         open_source(tmp_path / "data")
@@ -142,8 +143,9 @@ def test_a_dataset_and_an_evaluation_of_it_are_used_with_its_file(folder, tmp_pa
         main(["data", "relabel", "data", f"--task.object={text(folder, 'mug')}", "--workers=1", "--overwrite=true"])
         == 1
     )
-    assert main(["eval", "--policy.type=expert", f"--task.object={mesh}", *few]) == 0
     capsys.readouterr()
+    assert main(["eval", "--policy.type=expert", f"--task.object={mesh}", *few]) == 0
+    assert f"--task.object={mesh} --replay=" in capsys.readouterr().out
     assert main(["eval", "e", "--replay=4000000"]) in (1, 2)
     assert "--task.object=mesh:PATH/bowl.obj" in capsys.readouterr().err
     assert main(["eval", "e", "--replay=4000000", f"--task.object={mesh}"]) == 0
