@@ -110,7 +110,12 @@ class TrainOptions(Seeded, Trusting):
             words = "--policy.discover_packages_path=manip_il.lerobot_plugin", f"--fps={spec.fps}", "--robot.type=TYPE"
             say_next("--strategy.type=base", policy, *words, what="next, on its robot", program="lerobot-rollout")
         else:
-            say_next("eval", policy, *own_files(spec.robot, spec.task), f"--output_dir={self.output.output_dir}/eval")
+            say_next(
+                "eval",
+                policy,
+                *own_files(spec.robot, spec.task, spec.object),
+                f"--output_dir={self.output.output_dir}/eval",
+            )
 
     def config(self) -> FitConfig:
         """Return the trainer's configuration; `UsageError` if options contradict each other."""

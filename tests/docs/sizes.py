@@ -83,7 +83,9 @@ def small_words(words: Sequence[str]) -> list[str]:
     if name == "compare" and own[0].endswith(".yaml"):  # the study's own file has its sizes
         sizes = {option: size for option, size in sizes.items() if not option.startswith(("eval.", "env."))}
     if name == "serve":  # it serves for as long as a program runs
-        return [name, *with_sizes(own[: own.index("--") if "--" in own else None], sizes), "--", "true"]
+        served = own[: own.index("--") if "--" in own else None]
+        served = [word for word in served if not word.startswith("--log=")]  # nothing drives, so nothing is logged
+        return [name, *with_sizes(served, sizes), "--", "true"]
     return [*name.split(), *with_sizes(own, sizes)]
 
 

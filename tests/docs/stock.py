@@ -36,7 +36,7 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
 READ_BY = {"pairs.json": "runs/dagger"}  # what a file names, and a command that is given the file reads
 ARM = Path("my_arm.yaml")
 SAMPLE = "datasets/sample"  # comes with the repository
-_OUTPUTS = ("output", "output_dir", "output-dir", "video", "new_root")
+_OUTPUTS = ("output", "output_dir", "output-dir", "video", "new_root", "log")
 _TARGETS = ("data build", "data render", "data to-mcap", "data from-mcap", "pull")  # make their second
 
 

@@ -76,7 +76,7 @@ def test_a_gap_that_stops_growing_is_refused_where_it_does_with_the_joints_that_
     tree["gripper"] |= {"joints": ["right"], "closed": [-0.2], "open": [2.8]}
     model = model_of("hinges").replace('range="-0.4 0.8"', 'range="-0.4 3"')
     with pytest.raises(UsageError, match=r"(?s)as right goes.*undriven: left") as refused:
-        sweep(get_robot(str(write(tmp_path, tree=tree, model=model))))
+        sweep(get_robot(write(tmp_path, tree=tree, model=model)))
     numbers = r"from (\S+) to (\S+) m as right goes from (\S+) to (\S+);"
     before, after, start, end = map(float, re.search(numbers, str(refused.value)).groups())
     assert before >= after > 0.05

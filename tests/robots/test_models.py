@@ -224,7 +224,7 @@ def with_equality(folder: Path, equality: str) -> mujoco.MjModel:
     """Compile an arm with a rod beside its fore, whose joint is not the arm's, and an equality."""
     rod = '<body name="rod" pos="0.05 0 0"><joint name="bar"/><geom size="0.01"/></body><body name="fore"'
     model = model_of().replace("<equality>", f"<equality>{equality}").replace('<body name="fore"', rod)
-    return arm_spec(get_robot(str(write(folder, model=model)))).compile()
+    return arm_spec(get_robot(write(folder, model=model))).compile()
 
 
 @pytest.mark.parametrize(
