@@ -85,9 +85,9 @@ def test_other_code_is_found_by_the_packages_own_tables_alone():
         ("__init__.py", "__getattr__"),
         ("algorithms/run.py", "results"),
         ("cli/main.py", "load"),
-        ("cli/options.py", "type_of"),
         ("learn/lerobot_config.py", "policy_types"),
         ("mcap/read.py", "read_messages"),
+        ("option.py", "type_of"),
         ("sim/render.py", "_context"),
     }
 
@@ -99,6 +99,7 @@ def test_a_text_becomes_a_path_only_where_a_person_typed_it():
         ("tasks/config.py", "make_config"),
     }
     assert {(file, function) for file, function, _ in calls("make_config")} == {
+        ("api.py", "_env"),  # written in Python
         ("evaluation/robot_check.py", "check_robot"),  # of the robot on the command line
         ("tasks/envs.py", "make_env"),
     }
