@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from manip_il.cli.main import main
-from manip_il.collect.edits import open_source, render_states
+from manip_il.collect.edits import render_states
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.data import schema
-from manip_il.data.build import build, merge_datasets
+from manip_il.data.build import build
 from manip_il.data.journal import Journal, read_journal
-from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.examine import examine_folder
-from manip_il.errors import MismatchError
 from manip_il.evaluation.suites import varied
 from manip_il.mdp import Episode, State
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.shape import KINDS as SHAPES
-from manip_il.sim.variation import WORLD_SIZE, with_drawn
+from manip_il.sim.variation import with_drawn
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.envs import env_of
 
@@ -106,22 +102,6 @@ def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(
     build(tmp_path / "varied.journals", tmp_path / "varied")
     assert [one.drawn for one in read_episodes(tmp_path / "varied")] == [one.drawn for one in episodes]
     assert examine_folder(tmp_path / "varied") == []
-
-
-def test_a_dataset_from_before_is_read_and_said_to_lack_its_looks(tmp_path: Path):
-    varied, root = Condition("dim", brightness=(0.5, 0.7)), tmp_path / "older"
-    [episode] = RolloutJob(REACH, conditions=(varied,)).run([1])
-    states = np.delete(episode.columns[schema.SIM_STATE].astype(np.float64), range(-4 - WORLD_SIZE, -4), axis=1)
-    states[:, -4] -= WORLD_SIZE
-    spec = replace(env_spec(REACH), sim_state_size=states.shape[1])
-    older = replace(episode, columns={**episode.columns, schema.SIM_STATE: states}, drawn={})
-    about = {"fingerprint": env_fingerprint(REACH), "provenance": {"vary": [varied.to_json()]}}
-    write_dataset([older], root, spec, repo_id="local/older", **about)
-    assert "recorded before states held looks" in open_source(root).warnings[-1]
-    assert main(["data", "check", str(root)]) == 0
-    write_dataset([episode], tmp_path / "newer", env_spec(REACH), repo_id="local/newer", fingerprint={})
-    with pytest.raises(MismatchError, match="sim_state_size differs"):
-        merge_datasets([root, tmp_path / "newer"], tmp_path / "both", repo_id="local/both")
 
 
 def test_episodes_of_any_shape_say_which_they_have():
