@@ -222,12 +222,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [make(folder / f"set{number:02d}", number) for number in range(10)]
 
 
-@pytest.mark.usefixtures("no_child")
 def test_no_false_alarms(made):
     assert [(root.name, str(finding)) for root in made for finding in examine_folder(root)] == []
 
 
-@pytest.mark.usefixtures("no_child")
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.__name__)
 def test_planted_defects_are_found(made, tmp_path, plant):
     missed: list[str] = []
