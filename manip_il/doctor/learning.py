@@ -5,7 +5,6 @@ Motions are checked in episodes driven by a teacher; if a learner drives, action
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 
@@ -16,7 +15,7 @@ from PIL import Image
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import NUMBERS
-from manip_il.doctor.finding import Finding, edit, list_first, of_episodes, warning
+from manip_il.doctor.finding import Finding, list_first, of_episodes, warning
 from manip_il.mdp import Actor
 
 F64, Mask = NDArray[np.float64], NDArray[np.bool_]
@@ -33,7 +32,7 @@ _AGAIN = "correct the recorder, and record again"
 
 
 def check_motions(dataset: Dataset) -> Iterator[Finding]:
-    """Check for idle time, wrapping joints, lagging actions, changed zeros, unreached commands, ambiguous texts."""
+    """Check for idle time, wrapping joints, lagging actions, changed zeros, unreached commands."""
     features = [dataset.features.get(key) for key in (s.STATE, s.ACTION)]
     if not all(one and one.dtype in NUMBERS and len(one.shape) == 1 and one.size for one in features):
         return
@@ -46,7 +45,6 @@ def check_motions(dataset: Dataset) -> Iterator[Finding]:
         return  # reported by another check
     yield from _check_idle(dataset, rows, np.hstack([state, action]))
     yield from _check_wraps(dataset, rows, np.hstack([state, action]))
-    yield from _check_texts(dataset, rows, state)
     if action.shape == state.shape:  # both list the same joints, as for LeRobot's robots
         names = np.array(dataset.features[s.ACTION].labels)
         gripper = np.array([bool(_GRIPPER.search(name)) for name in names])
@@ -151,29 +149,6 @@ def _check_commands(rows: Rows, action: F64, state: F64, names: NDArray[np.str_]
             if share > _CLIPPED:
                 text = f"{name} is clipped at {limit:.6g} in {share:.0%} of the frames"
                 yield warning(s.ACTION, text, f"widen that limit: {_AGAIN}")
-
-
-def _check_texts(dataset: Dataset, rows: Rows, state: F64) -> Iterator[Finding]:
-    """Find two distinct motions that neither the text nor the first observation tells apart."""
-    points = np.array([np.linspace(span.start, span.stop - 1, 12).astype(int) for span in rows.values()])
-    paths = (state / np.maximum(state.std(axis=0), 1e-9))[points].reshape(len(points), -1)
-    seen = [one.key for one in dataset.info.of_dtype(*NUMBERS) if one.key.startswith("observation.")]
-    firsts = np.hstack([dataset.columns([key])[key][points[:, 0]].reshape(len(points), -1) for key in seen])
-    known = dict(zip(dataset.episodes.index.tolist(), dataset.episodes.tasks, strict=True))
-    texts = np.array([" ".join(known[episode]) for episode in rows])
-    for text in {*texts}:
-        same = np.flatnonzero(texts == text)
-        centred = paths[same] - paths[same].mean(axis=0)
-        if len(same) < _LEAST:
-            continue
-        apart = _find_apart(centred @ np.linalg.svd(centred, full_matrices=False)[2][0], 2.5)
-        here, there, episodes = firsts[same[apart]], firsts[same[~apart]], np.array([*rows])[same[apart]]
-        if 5 * len(here) < len(same) or (here.max(0) < there.min(0)).any() or (there.max(0) < here.min(0)).any():
-            continue  # too few, or the first observation tells them apart
-        what = f"{len(here)} of {len(same)} episodes ({list_first(episodes)}) move differently from the rest"
-        own = json.dumps(dict.fromkeys(map(str, episodes), "NEW TEXT"))
-        command = f"{edit(dataset.root, 'modify_tasks')} --operation.episode_tasks='{own}'"
-        yield warning("task", f"{what}, but share the text {text[:60]!r}", f"give them their own text: {command}")
 
 
 def check_cameras(dataset: Dataset) -> Iterator[Finding]:

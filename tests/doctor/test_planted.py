@@ -180,22 +180,20 @@ def joint(root: Path, rng: Rng) -> str:
 
 
 def commands(root: Path, rng: Rng) -> str:
-    """A gripper that does not follow, clipped actions, or one text for two motions."""
-    what = str(rng.choice(["but only moves", "is clipped", "move differently"]))
+    """A gripper that does not follow, or clipped actions."""
+    what = str(rng.choice(["but only moves", "is clipped"]))
     place, follows = int(rng.integers(4)), float(rng.choice([0.0, 0.4]))
     low, high = np.quantile(Dataset.open(root).columns([s.ACTION])[s.ACTION][:, place], [0.3, 0.7])
 
     def change(state: np.ndarray, action: np.ndarray) -> None:
         if what == "but only moves":
             state[:, 4] = 0.04 + (state[:, 4] - 0.04) * follows
-        elif what == "is clipped":
+        else:
             limits: Any = (low, None) if action[0, place] > low else (None, high)
             action[:, place] = action[:, place].clip(*limits)
-        else:
-            state[:, :4], action[:, :4] = 2 * state[0, :4] - state[:, :4], 2 * action[0, :4] - action[:, :4]
 
-    move(root, change, some(rng, 3) if what == "move differently" else range(COUNT))
-    return f"(action|task): .*{what}"
+    move(root, change)
+    return f"action: .*{what}"
 
 
 def wraps(root: Path, rng: Rng) -> str:
