@@ -44,8 +44,8 @@ def owner(world: World, body: int) -> str:
     return fingers.get(body, "")
 
 
-@pytest.mark.parametrize("robot", [*ROBOTS, *map(str, EXAMPLES)], ids=lambda robot: Path(robot).stem)
-def test_both_fingers_are_in_view(robot: str):
+@pytest.mark.parametrize("robot", [*ROBOTS, *EXAMPLES], ids=lambda robot: Path(robot).stem)
+def test_both_fingers_are_in_view(robot: str | Path):
     world = World(scene_of(robot, "reach"))
     scene, data = world.scene, world.data
     data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = scene.robot.home
