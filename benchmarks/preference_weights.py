@@ -98,11 +98,11 @@ def learn_reward(rounds: Path, folder: Path, draw: int, count: int) -> Path:
     for name, by, seed in (("even", "", draw), ("asked", f"--reward={first}", draw + 500)):
         pairs, answers = made / f"{name}_pairs.json", made / f"{name}.json"
         manip(f"reward pairs {rounds} --clip={_CLIP} --count={count} {by} --seed={seed} --output={pairs}")
-        manip(f"reward answer {pairs} --teacher=mistaken:0.1 --seed={seed} --output={answers}")
+        manip(f"reward answer {pairs} --sources={rounds} --teacher=mistaken:0.1 --seed={seed} --output={answers}")
         files.append(answers)
         given = f"{made / 'even_pairs.json'} {' '.join(map(str, files))}"
         more = f"--more_pairs={pairs}" if by else ""
-        run(f"reward fit {given} {more} --seed={draw}", reward if by else first)
+        run(f"reward fit {given} {more} --sources={rounds} --seed={draw}", reward if by else first)
     return reward
 
 

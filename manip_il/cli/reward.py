@@ -21,6 +21,12 @@ class OfPairs:
     """Options of a command on pairs of clips."""
 
     pairs: Path = option(MISSING, "pairs.json from manip-il reward pairs", positional=True, exists="")
+    sources: list[Path] = option(MISSING, "the datasets or runs from which the pairs were chosen", exists="datasets/")
+
+
+def sources_option(options: OfPairs | PairsOptions) -> str:
+    """Return the option that names the sources again, for the next command."""
+    return f"--sources={','.join(map(str, options.sources))}"
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,7 @@ class PairsOptions(Seeded):
         clips = choose_pairs(find_datasets(self.sources), self.clip, self.count, self.seed, rng, reward)
         write_json(self.file.output, clips.pairs.to_json())
         say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {self.file.output}")
-        say_next("reward", "ask", self.file.output, "--output=ask.html")
+        say_next("reward", "ask", self.file.output, sources_option(self), "--output=ask.html")
 
 
 @dataclass(frozen=True)
@@ -88,23 +94,24 @@ class AskOptions(OfPairs):
     as preferences.json.
     """
 
-    example: ClassVar[str] = "manip-il reward ask pairs.json --output=ask.html"
+    example: ClassVar[str] = "manip-il reward ask pairs.json --sources=runs/dagger --output=ask.html"
     file: OutputFile = group(OutputFile(Path("ask.html")), prefix="")
     robot: Path | None = option(None, "YAML file of the sources' robot, if it is your own")
 
     def run(self) -> None:
         """Render the films and write the page."""
         from manip_il.preferences.asking import render_films, render_page
+        from manip_il.preferences.frames import find_datasets
         from manip_il.preferences.pairs import Pairs, read_clips
 
         self.file.check()
-        clips = read_clips(Pairs.read(self.pairs))
+        clips = read_clips(Pairs.read(self.pairs), find_datasets(self.sources))
         with progress(len(clips.pairs), "render") as bar:
             films = render_films(clips, self.robot, bar.step)
         page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
         write_file(self.file.output, page.encode())
         say(f"{len(clips.pairs):,} pairs: {self.file.output}")
-        say_next("reward", "fit", self.pairs, "preferences.json", "--output_dir=runs/reward")
+        say_next("reward", "fit", self.pairs, "preferences.json", sources_option(self), "--output_dir=runs/reward")
 
 
 @dataclass(frozen=True)
@@ -115,22 +122,23 @@ class AnswerOptions(OfPairs, Seeded):
     of the pairs. A clip's return is the sum of progress over its steps.
     """
 
-    example: ClassVar[str] = "manip-il reward answer pairs.json --teacher=mistaken:0.1 --output=preferences.json"
+    example: ClassVar[str] = "manip-il reward answer pairs.json --sources=runs/dagger --output=preferences.json"
     teacher: str = option("perfect", "perfect, boltzmann[:TEMPERATURE] (default 1) or mistaken[:SHARE] (default 0.1)")
     file: OutputFile = group(OutputFile(Path("preferences.json")), prefix="")
 
     def run(self) -> None:
         """Compare every pair and write the answers."""
         from manip_il.preferences.answers import Teacher, answer_pairs
+        from manip_il.preferences.frames import find_datasets
         from manip_il.preferences.pairs import Pairs, read_clips
 
         self.file.check()
         teacher = Teacher.parse(self.teacher)
-        clips = read_clips(Pairs.read(self.pairs))
+        clips = read_clips(Pairs.read(self.pairs), find_datasets(self.sources))
         rng = rng_for(stream_base("training", self.seed), "teacher")
         write_json(self.file.output, answer_pairs(teacher, clips, rng).to_json())
         say(f"{len(clips.pairs):,} answers: {self.file.output}")
-        say_next("reward", "fit", self.pairs, self.file.output, "--output_dir=runs/reward")
+        say_next("reward", "fit", self.pairs, self.file.output, sources_option(self), "--output_dir=runs/reward")
 
 
 @dataclass(frozen=True)
@@ -141,7 +149,9 @@ class FitOptions(OfPairs, Seeded):
     answer, by one person or several, about PAIRS or --more_pairs. OUTPUT_DIR/pretrained_model holds the reward.
     """
 
-    example: ClassVar[str] = "manip-il reward fit pairs.json preferences.json --output_dir=runs/reward"
+    example: ClassVar[str] = (
+        "manip-il reward fit pairs.json preferences.json --sources=runs/dagger --output_dir=runs/reward"
+    )
     answers: list[Path] = option(MISSING, "preferences.json from ask or answer", positional=True, exists="")
     more_pairs: list[Path] = option(list, "further pairs.json of the same task and clip length", exists="")
     members: int = option(8, "number of networks in the ensemble, and of folds of the pairs", at_least=3, at_most=64)
@@ -154,15 +164,16 @@ class FitOptions(OfPairs, Seeded):
         from manip_il.learn.training_state import PRETRAINED_MODEL
         from manip_il.preferences.answers import Preferences, join_answers
         from manip_il.preferences.fitting import fit_answers, summary_lines
+        from manip_il.preferences.frames import find_datasets
         from manip_il.preferences.pairs import Pairs, join_pairs, read_clips
 
         pairs = [Pairs.read(path) for path in (self.pairs, *self.more_pairs)]
         answers = join_answers([Preferences.read(path, pairs) for path in self.answers])
-        clips = read_clips(join_pairs(pairs))
+        clips = read_clips(join_pairs(pairs), find_datasets(self.sources))
         with progress(None, f"fit {len(answers.better):,} answers") as bar:
             shape = shape_for(clips.frames[0].spec, self.members)
             found = fit_answers(clips, answers, shape, stream_base("training", self.seed), bar.step)
-        fingerprint = Dataset.open(Path(clips.pairs.sources[0].root)).fingerprint
+        fingerprint = Dataset.open(clips.roots[0]).fingerprint
         options = {"seed": self.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.clip}
         with self.output.open(self) as folder:
             target = folder / PRETRAINED_MODEL

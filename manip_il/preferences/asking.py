@@ -37,7 +37,7 @@ def render_films(clips: Clips, robot: Path | None = None, on_pair: Callable[[], 
     `ManipError` for sources whose states cannot be rendered.
     """
     pairs = clips.pairs
-    opened = [open_source(Path(source.root), robot) for source in pairs.sources]
+    opened = [open_source(root, robot) for root in clips.roots]
     states = [source.dataset.columns([schema.SIM_STATE])[schema.SIM_STATE] for source in opened]
     every = -(-pairs.control_hz // MOST_FPS)
     found: Films = []

@@ -30,7 +30,7 @@ FORMAT, VERSION = "manip_il pairs", 1
 
 @dataclass(frozen=True)
 class Source:
-    """A dataset. root: its folder, relative to where the command ran; sha256: `dataset_sha256`."""
+    """A dataset. root: its folder when the pairs were chosen, for messages alone; sha256: `dataset_sha256`."""
 
     root: str
     sha256: str
@@ -101,9 +101,10 @@ def read_file[Read](path: Path, form: str, version: int, make: Callable[[dict[st
 
 @dataclass(frozen=True, eq=False)
 class Clips:
-    """Pairs together with the frames of their datasets."""
+    """Pairs together with their datasets, in the order of `Pairs.sources`, and the frames of those."""
 
     pairs: Pairs
+    roots: tuple[Path, ...]
     frames: tuple[Frames, ...]
 
     @cached_property
@@ -149,15 +150,21 @@ def join_pairs(given: Sequence[Pairs]) -> Pairs:
     return replace(first, sources=sources, pairs=tuple(joined))
 
 
-def read_clips(pairs: Pairs) -> Clips:
-    """Return the clips of pairs. Raises `ManipError` if a dataset is missing or has changed since."""
+def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
+    """Return the clips of pairs.
+
+    Args:
+        pairs: The pairs. The paths stored in them are never opened: their datasets are recognised by their hashes.
+        roots: Datasets that the user named, in any order, at least those of the pairs.
+
+    Raises `ManipError` if a dataset of the pairs is missing or has changed since.
+    """
+    found = {dataset_sha256(root): root for root in roots}
     for source in pairs.sources:
-        root = Path(source.root)
-        if not root.is_dir():
-            raise ManipError(f"the pairs' dataset {root} is missing; run in the folder where the pairs were chosen")
-        if (found := dataset_sha256(root)) != source.sha256:
-            raise MismatchError(f"sha256 of {root}", "the file of pairs", source.sha256[:12], "the dataset", found[:12])
-    return Clips(pairs, tuple(read_all([Path(source.root) for source in pairs.sources])))
+        if source.sha256 not in found:
+            raise ManipError(f"the pairs' dataset {source.root} is not among the sources, or has changed since")
+    used = tuple(found[source.sha256] for source in pairs.sources)
+    return Clips(pairs, used, tuple(read_all(used)))
 
 
 def choose_pairs(
@@ -197,10 +204,10 @@ def choose_pairs(
         seed=seed,
     )
     if reward is not None:
-        spread = disagreement(Clips(made, frames), reward.members)
+        spread = disagreement(Clips(made, tuple(roots), frames), reward.members)
         kept = np.sort(np.argsort(-spread, kind="stable")[:count])
         made = replace(made, pairs=tuple(drawn[place] for place in kept), chosen="where rewards disagree")
-    return Clips(made, frames)
+    return Clips(made, tuple(roots), frames)
 
 
 def disagreement(clips: Clips, members: Members) -> F64:

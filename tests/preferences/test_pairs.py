@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from manip_il.errors import MismatchError
+from manip_il.errors import ManipError, MismatchError
 from manip_il.preferences.answers import Answer, Preferences
 from manip_il.preferences.frames import find_datasets
 from manip_il.preferences.pairs import Pairs, choose_pairs, disagreement, join_pairs, read_clips
@@ -60,14 +60,21 @@ def test_pairs_are_the_same_from_their_file(clips, tmp_path):
     path = tmp_path / "pairs.json"
     path.write_text(json.dumps(clips.pairs.to_json()))
     assert Pairs.read(path) == clips.pairs
-    assert (read_clips(Pairs.read(path)).rows == clips.rows).all()
+    assert (read_clips(Pairs.read(path), clips.roots).rows == clips.rows).all()
 
 
 def test_a_dataset_that_was_changed_since_is_refused(clips):
     tree = clips.pairs.to_json()
     tree["sources"][0]["sha256"] = "0" * 64
-    with pytest.raises(MismatchError, match=r"sha256 of .*good differs"):
-        read_clips(Pairs.from_json(tree))
+    with pytest.raises(ManipError, match=r"dataset .*good is not among the sources, or has changed since"):
+        read_clips(Pairs.from_json(tree), clips.roots)
+
+
+def test_no_path_in_a_file_of_pairs_is_opened(clips):
+    tree = clips.pairs.to_json()
+    for source in tree["sources"]:
+        source["root"] = "nowhere"
+    assert (read_clips(Pairs.from_json(tree), clips.roots).inputs == clips.inputs).all()
 
 
 def test_answers_to_a_second_file_of_pairs_are_about_its_clips(datasets, tmp_path):
@@ -77,8 +84,8 @@ def test_answers_to_a_second_file_of_pairs_are_about_its_clips(datasets, tmp_pat
     joined = join_pairs(files)
     assert len(joined) == 19
     assert [source.root for source in joined.sources] == list(map(str, roots))
-    both = read_clips(joined)
-    alone = read_clips(files[1])
+    both = read_clips(joined, roots)
+    alone = read_clips(files[1], roots)
     assert (both.inputs[both.rows[12:]] == alone.inputs[alone.rows]).all()
     path = tmp_path / "preferences.json"
     path.write_text(json.dumps(Preferences(files[1].sha256, "Ada", (Answer(3, "left"),)).to_json()))

@@ -45,7 +45,9 @@ def test_a_boltzmann_teacher_errs_the_more_the_higher_its_temperature(many):
 
 def test_clips_that_are_alike_are_answered_equal(many):
     alike = tuple(replace(one, progress=np.full(len(one.states), 0.5)) for one in many.frames)
-    assert set(Teacher.parse("perfect").answers(Clips(many.pairs, alike), np.random.default_rng(0))) == {"equal"}
+    assert set(Teacher.parse("perfect").answers(Clips(many.pairs, many.roots, alike), np.random.default_rng(0))) == {
+        "equal"
+    }
 
 
 def test_the_same_seed_answers_the_same(many):
