@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting, path_options
 from manip_il.cli.options import Given, command_line, given, group, to_plain
-from manip_il.cli.outputs import ResumableOutput, publish
+from manip_il.cli.outputs import OutputFile, ResumableOutput, publish
 from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, UsageError, shorten
@@ -155,6 +155,8 @@ class EvalOptions(Tested, Seeded, Trusting):
         from manip_il.evaluation.results import EvalResult
         from manip_il.evaluation.runner import episode_result, replay_differences
 
+        if self.video is not None:
+            OutputFile(self.video, overwrite=self.output.overwrite).check()
         result = EvalResult.read(file)
         by_seed = {episode.seed: episode for episode in result.episodes}
         if seed not in by_seed:

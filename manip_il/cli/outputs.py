@@ -12,7 +12,14 @@ from manip_il.cli.options import options_of
 from manip_il.cli.parsing import dump_yaml, from_yaml
 from manip_il.cli.progress import say
 from manip_il.data.atomic import clear, exclusive, write_file, write_json
-from manip_il.data.ownership import CONFIG_FILE, PARTIAL, kind_of, output_of, require_replaceable
+from manip_il.data.ownership import (
+    CONFIG_FILE,
+    PARTIAL,
+    is_our_file,
+    kind_of,
+    output_of,
+    require_replaceable,
+)
 from manip_il.errors import MismatchError, UsageError
 from manip_il.option import option
 
@@ -92,9 +99,15 @@ class OutputFile(Replacing):
     output: Path = option(MISSING, "output file")
 
     def check(self) -> None:
-        """Raise `UsageError` if the file exists and may not be replaced."""
-        if self.output.is_dir() or (self.output.exists() and not self.overwrite):
-            raise UsageError(f"{self.output} already exists; choose another --output, or give --overwrite=true")
+        """Raise `UsageError` if the file exists, unless it may be replaced and this program wrote it."""
+        if not self.output.exists():
+            return
+        if not is_our_file(self.output):
+            raise UsageError(
+                f"{self.output} exists and does not say that manip-il wrote it; choose another name"
+            )
+        if not self.overwrite:
+            raise UsageError(f"{self.output} already exists; choose another name, or give --overwrite=true")
 
 
 def prepare_output(

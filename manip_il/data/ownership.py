@@ -57,6 +57,11 @@ def kind_of(folder: Path) -> str | None:
     return None
 
 
+def is_our_file(path: Path) -> bool:
+    """Return whether a file names this program, as each single file that a command writes does."""
+    return path.is_file() and re.search(rb"manip[-_]il", checks.read_bytes(path, "a file")) is not None
+
+
 def require_ours(folder: Path, kind: str) -> None:
     """Raise `UsageError` unless there is nothing at `folder`, or a folder of this kind."""
     there = kind_of(folder)

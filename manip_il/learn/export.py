@@ -96,6 +96,7 @@ def export_onnx(path: Path) -> tuple[bytes, float]:
     model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = policy.checkpoint.action
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
     onnx.helper.set_model_props(model, texts)
+    model.producer_name = "manip-il"
     onnx.checker.check_model(model, full_check=True)
     data = model.SerializeToString()
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])

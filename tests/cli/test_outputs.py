@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.cli.outputs import CONFIG_FILE, check_same_options, prepare_output, save_options
+from manip_il.cli.outputs import CONFIG_FILE, OutputFile, check_same_options, prepare_output, save_options
 from manip_il.cli.parsing import CONFIG_HEADER
 from manip_il.cli.record import DatasetGroup, RecordOptions
 from manip_il.cli.train import SourceGroup, TrainOptions
@@ -87,6 +87,18 @@ def test_overwrite_deletes_the_same_kind_that_this_program_made_and_nothing_else
         overwrite(tmp_path / "run", kind)
         assert list((tmp_path / "run").iterdir()) == []
         assert (tmp_path / "run").stat().st_ino == inode, "it may be a mount point"
+
+
+@pytest.mark.parametrize("name", ["a.onnx", "pairs.json", "ask.html", "replay.mp4"])
+def test_overwrite_replaces_a_single_file_only_if_it_names_this_program(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(b"years of work")
+    with pytest.raises(UsageError, match="does not say that manip-il wrote it"):
+        OutputFile(path, overwrite=True).check()
+    path.write_bytes(b'\x08{"format": "manip_il pairs"}')
+    OutputFile(path, overwrite=True).check()
+    with pytest.raises(UsageError, match="--overwrite=true"):
+        OutputFile(path).check()
 
 
 def test_an_evaluation_does_not_replace_a_dataset(tmp_path):
