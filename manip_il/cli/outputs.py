@@ -103,9 +103,7 @@ class OutputFile(Replacing):
         if not self.output.exists():
             return
         if not is_our_file(self.output):
-            raise UsageError(
-                f"{self.output} exists and does not say that manip-il wrote it; choose another name"
-            )
+            raise UsageError(f"{self.output} exists and does not say that manip-il wrote it; choose another name")
         if not self.overwrite:
             raise UsageError(f"{self.output} already exists; choose another name, or give --overwrite=true")
 

@@ -32,13 +32,6 @@ from manip_il.option import check_bound, type_of
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 _MOST_OFFERED = 3  # names that an error suggests
-_FORMER = {  # former options, ignored in a file if they have these values
-    "task.reward": "",
-    "ppo.gae_lambda": 0.95,
-    "ppo.clip_range": 0.2,
-    "ppo.entropy": 0.0,
-    "ppo.target_kl": 0.05,
-}
 type Known = Mapping[str, Option]
 
 
@@ -167,7 +160,7 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
                 raise UsageError(f"{origin}: {name} can only be set on the command line; give --{name}=...")
         elif any(other == name or other.startswith(f"{name}.") for other in known):
             raw |= _read_tree(value, known, origin, f"{name}.")
-        elif name not in _FORMER or value != _FORMER[name]:
+        else:
             raise _unknown_option(f"key in {origin}:", name, known, "", "COMMAND")
     return raw
 

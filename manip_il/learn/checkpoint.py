@@ -237,7 +237,7 @@ def _size(key: str, shape: Sequence[int]) -> int:
 def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tuple[str, str, tuple[int, ...]]:
     """Return action space, robot and grippers: from the configuration of mlp and cnn, or the postprocessor's step.
 
-    Older checkpoints do not name the grippers; in these, only the last number counts as one.
+    Where no grippers are named, only the last number counts as one.
     """
     options: Mapping[str, Any] = next((one["config"] for one in steps if one["registry_name"] == DECODER), {})
     own = config["type"] in OWN_SPACE

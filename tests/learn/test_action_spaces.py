@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ from manip_il.data.joined import JoinedDatasets
 from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.action_spaces import Conversion
-from manip_il.learn.checkpoint import META_FILE, Checkpoint
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.export import export_onnx
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
@@ -96,7 +94,7 @@ def test_joint_spaces_lose_nothing(robot, space):
 
 
 @pytest.mark.parametrize("settings", [{"width": 8}, ACT], ids=["mlp", "act"])
-def test_both_grippers_of_two_arms_are_absolute_but_an_older_checkpoint_goes_on_as_it_was_trained(settings, tmp_path):
+def test_both_grippers_of_two_arms_are_absolute(settings, tmp_path):
     names = tuple(f"{side}_{number}" for side in ("left", "right") for number in range(7))
     spec = RobotTaskSpec("aloha", "lift", 50, names, ("e0", "e1"), 5, "lift", action_meaning=TWO_ARMS)
     rng = np.random.default_rng(0)
@@ -109,15 +107,6 @@ def test_both_grippers_of_two_arms_are_absolute_but_an_older_checkpoint_goes_on_
     targets = Conversion(JOINT_DELTA, grippers=found.grippers).encode(actions, states)
     absolute = (targets == actions).all(axis=0)
     assert (found.grippers, np.flatnonzero(absolute).tolist()) == ((6, 13), [6, 13])
-    before = LearnedPolicy.load(path).act(states, np.zeros((len(states), 2)))
-    for file in (path / "config.json", path / "policy_postprocessor.json"):  # as older versions wrote them
-        file.write_text(re.sub(r',\s*"grippers": \[[^]]*\]', "", file.read_text()))
-    assert Checkpoint.open(path).grippers == (-1,)
-    after = LearnedPolicy.load(path).act(states, np.zeros((len(states), 2)))
-    np.testing.assert_allclose(after - before, states * (np.arange(14) == 6), atol=1e-6)
-    more = trainer_of(sources, tmp_path / "more", {"path": str(path)}, None)
-    more.fit()
-    assert Checkpoint.open(tmp_path / "more/checkpoints/last/pretrained_model").grippers == (-1,)
 
 
 @every_large_robot
@@ -212,17 +201,6 @@ def test_a_checkpoint_goes_on_in_its_own_space_alone(table, sources, tmp_path):
         trainer_of(sources, tmp_path / "other", {"path": str(path)}, JOINT_DELTA)
     with pytest.raises(ManipError, match="cannot be exported; train with joint_delta"):
         export_onnx(path)
-
-
-def test_a_checkpoint_from_before_there_was_a_choice_acts_as_it_did(table, sources, tmp_path):
-    path = Trainer(sources, FitConfig({"width": 8}, **SMALL), tmp_path).fit()
-    observed = table[STATE], table["observation.environment_state"]
-    acted = LearnedPolicy.load(path).act(*observed)
-    for name in ("config.json", META_FILE):
-        old = json.loads((path / name).read_text())
-        assert old.pop("action_space") == JOINT_DELTA
-        (path / name).write_text(json.dumps(old))
-    np.testing.assert_array_equal(LearnedPolicy.load(path).act(*observed), acted)
 
 
 def test_lerobots_own_training_has_no_kinematics(table, sources):
