@@ -1,4 +1,4 @@
-"""What arrives from a remote is counted while it comes, and may not be larger than the remote's list says."""
+"""What arrives from a remote is counted while it comes: files against the remote's list, answers against a limit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Arrival(Callback):
     def call(self, *hook: Any, **given: Any) -> None:
         """Raise `RemoteError` if there are too many bytes."""
         if self.value > self.most:
-            raise RemoteError(f"it sends more than the {self.most:,} bytes that its list says; nothing was kept")
+            raise RemoteError(f"it sends more than the {self.most:,} bytes that were expected; nothing was kept")
 
     def __call__(self, *given: Any, **options: Any) -> Arrival:
         """Return the bar, for huggingface_hub."""

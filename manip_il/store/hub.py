@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Generator, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,7 @@ _ADDRESS = re.compile(r"(datasets/|models/)?((?!datasets/|models/)\w[\w.-]*/\w[\
 _HIDDEN = re.compile(r"(.*/)?\.[^./]")  # such as the Hub's own .gitattributes
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _OF_A_DATASET = ("data/", "meta/", "videos/")  # the layout's folders, which are replaced as one
+_ANSWERS = ContextVar[Arrival | None]("_ANSWERS", default=None)  # of the action in progress
 
 
 def _guard_token(request: httpx.Request) -> None:
@@ -40,15 +43,37 @@ def _guard_token(request: httpx.Request) -> None:
         request.headers.pop("authorization", None)
 
 
+def _count(response: httpx.Response) -> None:
+    """Count an answer's bytes, as decompressed, whoever reads it."""
+    arrival, chunks = _ANSWERS.get() or Arrival(checks.LARGEST_READ), response.iter_bytes
+
+    def counted(chunk_size: int | None = None) -> Iterator[bytes]:
+        for chunk in chunks(chunk_size):
+            arrival.update(len(chunk))
+            yield chunk
+
+    response.iter_bytes = counted
+
+
+@contextmanager
+def _bounded(size: int = 0) -> Generator[None]:
+    """Bound all answers in this block together. size: of the file that they bring."""
+    token = _ANSWERS.set(Arrival(checks.LARGEST_READ + size))
+    try:
+        yield
+    finally:
+        _ANSWERS.reset(token)
+
+
 @cache
 def _use_client() -> None:
-    """Have huggingface_hub guard the token from now on."""
+    """Have huggingface_hub guard the token and count what arrives from now on."""
     set_client_factory(_client)
 
 
 def _client() -> httpx.Client:
     client = default_client_factory()
-    client.event_hooks = {"request": [*client.event_hooks["request"], _guard_token]}
+    client.event_hooks = {"request": [*client.event_hooks["request"], _guard_token], "response": [_count]}
     return client
 
 
@@ -74,7 +99,7 @@ class Hub:
 
     def read(self) -> Manifest | None:
         """Return the current version; None if the repository or the revision does not exist."""
-        with explained(f"read {self.name}"):
+        with explained(f"read {self.name}"), _bounded():
             try:
                 about: Any = self._api.repo_info(**self._repo, revision=self._revision)
             except (RepositoryNotFoundError, RevisionNotFoundError):
@@ -138,7 +163,7 @@ class Hub:
 
     def write(self, plan: PushPlan) -> None:
         """Commit on top of `plan.before` (the Hub refuses if it is outdated), then move a dataset's tag."""
-        with explained(f"push to {self.name}"):
+        with explained(f"push to {self.name}"), _bounded():
             before, gone = plan.before or self._create(), plan.remove
             if plan.before is None:  # a new branch begins with the files of the main branch
                 gone = sorted(before.files.keys() & self.pushed(before).keys() - plan.manifest.files.keys())
@@ -157,8 +182,10 @@ class Hub:
         """Download a file of a version to the same path in a folder, without checking its hash."""
         where: Any = {**self._repo, "revision": manifest.version, "local_dir": folder}
         file = manifest.files.get(path)
-        bounded: Any = Arrival(file.size if file else checks.LARGEST_READ)
-        self._api.hf_hub_download(filename=path, force_download=True, tqdm_class=bounded, **where)
+        most = file.size if file else checks.LARGEST_READ
+        bounded: Any = Arrival(most)  # some servers send a file by other means than answers
+        with _bounded(most):
+            self._api.hf_hub_download(filename=path, force_download=True, tqdm_class=bounded, **where)
 
     def _create(self) -> Manifest:
         """Create the repository and the branch; return the branch's content: empty, or as on the main branch."""

@@ -145,6 +145,18 @@ def test_a_hub_that_sends_more_than_it_lists_is_not_listened_to(how: str, hub: H
     assert not list(tmp_path.glob("*got*"))
 
 
+@pytest.mark.parametrize("asked", ["/api/models/user/policy?", "/tree/", "/commit/"])
+def test_an_answer_without_an_end_is_not_read_to_it(asked: str, hub: Hub, tmp_path: Path, monkeypatch):
+    run, most = make_run(tmp_path / "run"), 5_000_000
+    push(run, open_remote(POLICY, quiet=True))
+    (run / "new.txt").write_text("new")
+    monkeypatch.setattr("manip_il.checks.LARGEST_READ", most)
+    hub.change = lambda line, body: gzip.compress(body + b" " * 10 * most) if asked in line else body
+    hub.headers = lambda line: {"Content-Encoding": "gzip"} if asked in line else {}
+    with pytest.raises(ManipError, match="sends more than"):
+        push(run, open_remote(POLICY, quiet=True))
+
+
 def test_a_pipe_in_the_place_of_a_manifest_does_not_hang(tmp_path: Path):
     (tmp_path / "store").mkdir()
     os.mkfifo(tmp_path / "store" / "manip_il_manifest.json")
