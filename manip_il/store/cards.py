@@ -1,4 +1,4 @@
-"""Cards for the Hub: `README.md` of a dataset or policy, from `card.md.jinja`, and a picture of its cameras.
+"""Cards for the Hub: `README.md` of a dataset or policy, from `card.md.jinja`.
 
 Cards hold no absolute path, token or date, so that the same folder gives the same bytes. A card of another program's
 dataset or policy claims neither our licence nor our authorship.
@@ -6,7 +6,6 @@ dataset or policy claims neither our licence nor our authorship.
 
 from __future__ import annotations
 
-import re
 import shlex
 from importlib.metadata import version
 from pathlib import Path
@@ -14,14 +13,12 @@ from typing import Any
 
 import jinja2
 import numpy as np
-from matplotlib.figure import Figure
 
 from manip_il import checks
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.lerobot_layout import INFO
-from manip_il.doctor.finding import journals_of
 from manip_il.errors import ManipError
 from manip_il.sim.conditions import NOMINAL
 from manip_il.store.errors import redact
@@ -29,35 +26,25 @@ from manip_il.store.manifest import CARD, CONFIG, Kind, policy_folder
 from manip_il.tasks import ENV_IDS
 from manip_il.tasks.stock.table import ALOHA
 
-PICTURE = "assets/episodes.png"
-_FRAMES = 6  # per camera
 _OURS = b"<!-- written by manip-il push -->"  # a card with this line is ours and is replaced
-_NOT_SHOWN = re.compile(  # lines of options that are paths, concern one machine, or may be secrets
-    r"/|```|^ *(root|output_dir|repo_id|config_path|resume|overwrite|engine|device|workers|threads|num_workers|memory|"
-    r"image_cache_gb|log_freq|save_freq|tensorboard):|(?i:token|secret|passw|credential|api_?key)"
-)
 
 
 def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, Path]:
-    """Write a card and a picture into `folder`; return them by their paths in the repository. place: USER/NAME.
+    """Write a card into `folder`; return it by its path in the repository. place: USER/NAME.
 
-    A `README.md` that is not ours is kept, and is not in the result. Raises `ManipError` if the folder cannot be read.
+    A `README.md` that is not ours is kept, and the result is empty. Raises `ManipError` if the folder cannot be read.
     """
     made, dataset = dict[str, Path](), Dataset.open(root) if kind == "dataset" else None
-    if dataset and dataset.cameras:
-        made[PICTURE] = folder / "episodes.png"
-        draw_picture(dataset, made[PICTURE])
     if not (root / CARD).is_file() or _OURS in checks.read_bytes(root / CARD, "a card"):
         environment = jinja2.Environment(finalize=_shown)
         environment.filters["word"] = lambda value: shlex.quote(_shown(str(value)))
         environment.filters["cell"] = lambda value: " ".join(str(value).split()).replace("|", "\\|")
         template = environment.from_string(Path(__file__).with_name("card.md.jinja").read_text(encoding="utf-8"))
-        facts = {"place": place, "version": version("manip_il"), "picture": PICTURE if made else None}
+        facts: dict[str, Any] = {"place": place, "version": version("manip_il")}
         try:
             if dataset:
                 seeds = np.unique(dataset.columns([s.SEED])[s.SEED]).tolist() if s.SEED in dataset.features else []
-                made_by = options(journals_of(root)) or options(root.absolute().parent)
-                facts |= {"dataset": dataset, "is_ours": bool(dataset.own), "seeds": seeds, "options": made_by}
+                facts |= {"dataset": dataset, "is_ours": bool(dataset.own), "seeds": seeds}
             else:
                 facts |= policy_facts(root)
             made[CARD] = folder / CARD
@@ -97,7 +84,6 @@ def policy_facts(root: Path) -> dict[str, Any]:
         "is_ours": bool(facts["manip_il"]),
         "lerobot_words": words,
         "fitted_to": fitted_to,
-        "options": options(root),
     }
 
 
@@ -108,22 +94,3 @@ def lerobot_words(robot: str | None, task: str) -> list[str]:
         return ["--env.type=aloha", f"--env.task={task}"]
     named = next((env_id for env_id, names in ENV_IDS.items() if names == (robot, name)), None)
     return ["--env.type=manip_il", f"--env.task={named.partition('/')[2]}{colon}{argument}"] if named else []
-
-
-def options(folder: Path) -> str:
-    """Return the folder's `config.yaml` without paths, machine-specific options and secrets; "" if it is not ours."""
-    path = folder / "config.yaml"
-    text = checks.read_bytes(path, "options").decode(errors="replace") if path.is_file() else ""
-    shown = [line for line in text.splitlines() if not _NOT_SHOWN.search(line)]
-    return "\n".join(shown) if text.startswith("# manip-il") else ""
-
-
-def draw_picture(dataset: Dataset, path: Path) -> None:
-    """Draw evenly spaced frames of the first episode, one row per camera."""
-    rows, cameras = dataset.rows_of(0), dataset.cameras
-    picked = rows[np.unique(np.linspace(0, len(rows) - 1, _FRAMES).round().astype(int))]
-    figure = Figure((8, 8 / _FRAMES * len(cameras)), layout="constrained")
-    for axis, key in zip(figure.subplots(len(cameras), squeeze=False)[:, 0], cameras, strict=True):
-        axis.imshow(np.concatenate(list(dataset.frames(key, picked)), axis=1))
-        axis.axis("off")
-    figure.savefig(path, dpi=100, metadata={"Software": None})

@@ -26,6 +26,7 @@ from manip_il import checks
 from manip_il.data.lerobot_layout import VERSION
 from manip_il.errors import UsageError
 from manip_il.store.arrival import Arrival
+from manip_il.store.cards import write_cards
 from manip_il.store.errors import SENT, RemoteError, explained
 from manip_il.store.manifest import CARD, CONFIG, MANIFEST_FILE, File, Kind, Manifest, PushPlan, policy_folder
 
@@ -143,16 +144,14 @@ class Hub:
             return pushed
 
     def with_card(self, source: Path, local: Mapping[str, Path], folder: Path, keeps: bool) -> dict[str, Path]:
-        """Return the files to push: `local`, a card with its picture, and a run's policy at the root.
+        """Return the files to push: `local`, a card, and a run's policy at the root.
 
         Args:
             source: The dataset, run or policy.
             local: Its files by their paths in the repository.
-            folder: Where card and picture are written.
+            folder: Where the card is written.
             keeps: Whether the repository keeps its own card.
         """
-        from manip_il.store.cards import write_cards  # imported here because no other remote needs matplotlib
-
         added = write_cards(source, self.kind, self._place, folder)
         if keeps and added.pop(CARD, None):
             local = {path: file for path, file in local.items() if path != CARD}
