@@ -73,8 +73,9 @@ class ViewModel:
             self.model.geom_type[self._objects] = kind
         self._paint(self._objects, part(variation, "colour"))
         self._paint(self._table, part(variation, "table"))
-        for name in CAMERAS:
-            self._move_camera(name, part(variation, f"camera_shift.{name}"), part(variation, f"camera_turn.{name}"))
+        shifts, turns = (part(variation, name).reshape(-1, 3) for name in ("camera_shift", "camera_turn"))
+        for moved in zip(CAMERAS, shifts, turns, strict=True):
+            self._move_camera(*moved)
         self._light(float(part(variation, "brightness")[0]), float(part(variation, "light_turn")[0]))
         self._applied = variation.copy()
 
