@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -24,6 +25,7 @@ from manip_il.sim.task import Fitting, Task
 from manip_il.sim.variation import Object
 from manip_il.sim.world import Scene
 
+_EMPTY = Path(__file__).with_name("empty.xml")
 PREFIX = "robot/"  # prefix of the robot's names in a scene
 TABLE = "table"  # name of the table's geom
 _THICK = 0.04  # thickness of the table's top [m]
@@ -36,7 +38,6 @@ _CAMERAS = {"front": (0.80, -0.15, 0.55), "side": (-0.05, -0.80, 0.50)}  # [m]
 _LOOK_AT, _FIELD = 0.17, 42.0  # [m], [deg]
 _ON_TABLE = 0.02  # a robot stands on the table only if its lowest point is this near to the table's top [m]
 _PEDESTAL = 0.13  # half the pedestal's width [m]
-_SHADOW_SIZE = 1024  # side of the shadow map [pixels]: the main cost on a software renderer
 
 
 @lru_cache(SCENES_KEPT)
@@ -61,12 +62,8 @@ def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
 
 def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     """Return the uncompiled scene; world z = 0 is the table's top, x points away from the robot."""
-    spec = mujoco.MjSpec()
+    spec = mujoco.MjSpec.from_file(str(_EMPTY))
     spec.modelname = f"{robot.name}_{task.name}"
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10  # holds the cube: with the pyramidal default it creeps out of the hand
-    _add_look(spec)
     _add_table(spec, robot)
     arm = arm_spec(robot)
     arm_alone = arm.copy().compile()
@@ -168,8 +165,12 @@ def _check_objects(
                 "free), "
             )
         else:  # width between the fingers if the object lies on its worst side
-            kind, size = int(model.geom_type[objects[name].geom]), model.geom_size[objects[name].geom]
-            lengths = variation.extents(kind, size)
+            kind, lengths = int(model.geom_type[objects[name].geom]), 2 * model.geom_aabb[objects[name].geom, 3:]
+            if kind not in variation.KINDS:
+                raise UsageError(
+                    f"task {task.name}: the first geom of {name!r} is of MuJoCo's type {kind}; expected "
+                    f"{', '.join(variation.GEOMS)} or mesh"
+                )
             width = float(np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0])
             fits = width < gripper.most
         if not fits:
@@ -191,34 +192,6 @@ def _action_space(robot: Robot, joints: list[mujoco._structs._MjModelJointViews]
         low, high, scale = (np.degrees(one) for one in (low, high, scale))
         low[-1], high[-1], scale[-1] = *ends, np.ptp(ends)
     return ActionSpace(robot.joint_names, low, high, scale, relative, units)
-
-
-def _add_look(spec: mujoco.MjSpec) -> None:
-    spec.visual.headlight.ambient = [0.32, 0.32, 0.34]
-    spec.visual.headlight.diffuse = [0.22, 0.22, 0.22]
-    spec.visual.headlight.specular = [0.0, 0.0, 0.0]
-    spec.visual.quality.shadowsize = _SHADOW_SIZE
-    spec.visual.map.znear = 0.01
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.84, 0.88, 0.92],
-        rgb2=[0.55, 0.62, 0.70],
-        width=256,
-        height=256 * 6,
-    )
-    spec.add_material(name="floor", rgba=[0.80, 0.83, 0.86, 1], specular=0.0, emission=0.25)
-    spec.add_material(name="table", rgba=[0.80, 0.70, 0.57, 1], specular=0.15, shininess=0.3)
-    spec.worldbody.add_light(
-        pos=[0.9, -0.9, 1.8],
-        dir=[-0.35, 0.75, -1.5],
-        diffuse=[0.62, 0.60, 0.56],
-        specular=[0.2, 0.2, 0.2],
-        castshadow=True,
-    )
-    spec.worldbody.add_light(pos=[-0.5, 1.2, 1.5], dir=[0.6, -0.7, -1.0], diffuse=[0.2, 0.22, 0.26], castshadow=False)
 
 
 def _add_table(spec: mujoco.MjSpec, robot: Robot) -> None:

@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import ManipError, MismatchError
 from manip_il.sim.config import CAMERAS
 from manip_il.sim.ranges import OWN, RANGES
 from manip_il.sim.shape import Shape, contact
@@ -26,7 +25,7 @@ GEOMS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
-_KINDS = {int(geom): kind for kind, geom in GEOMS.items()}
+KINDS = {int(geom): kind for kind, geom in GEOMS.items()}
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 PER_OBJECT = 5
 _SIZE, _MASS, _FRICTION = slice(0, 3), 3, 4
@@ -54,11 +53,11 @@ class Object:
 
 def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
     """Return the variation of a model as compiled, (v,)."""
-    parts = [
-        np.concatenate([model.geom_size[one.geom], [model.body_mass[one.body], model.geom_friction[one.geom, 0]]])
+    rows = [
+        [*model.geom_size[one.geom], model.body_mass[one.body], model.geom_friction[one.geom, 0]]
         for one in objects.values()
     ]
-    return np.concatenate([*parts, NOTHING_DRAWN])
+    return np.concatenate([*rows, NOTHING_DRAWN])
 
 
 def part(variation: F64, name: str) -> F64:
@@ -78,12 +77,6 @@ def _world(variation: F64) -> F64:
 
 def _objects(variation: F64) -> F64:
     return variation[: len(variation) - WORLD_SIZE].reshape(-1, PER_OBJECT)
-
-
-def check_size(variation: F64, like: F64) -> None:
-    """Raise `MismatchError` unless a variation (v,) is as long as the scene's own, `like` (v,)."""
-    if variation.shape != like.shape:
-        raise MismatchError("size of the variation", "the state", len(variation), "the scene", len(like))
 
 
 def same_physics(variation: F64, other: F64) -> bool:
@@ -147,43 +140,27 @@ def _apply_dynamics(changed: Any, plain: mujoco.MjModel, motors: NDArray[np.int6
 
 
 def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, shape: int | None) -> None:
-    geom, size, mass, friction = one.geom, row[_SIZE], float(row[_MASS]), float(row[_FRICTION])
+    geom, body = one.geom, one.body
+    size, mass, friction = row[_SIZE], float(row[_MASS]), float(row[_FRICTION])
     own = int(plain.geom_type[geom])
     kind, condim, rolling = own, int(plain.geom_condim[geom]), float(plain.geom_friction[geom, 2])
     if shape is not None:
-        kind, (condim, rolling) = shape, contact(_KINDS[shape])
-    like, at, inertia = plain, geom, plain.body_inertia[one.body] * (mass / plain.body_mass[one.body])
-    if kind != _MESH and (kind != own or not np.array_equal(size, plain.geom_size[geom])):
+        kind, (condim, rolling) = shape, contact(KINDS[shape])
+    nodes = slice(plain.body_bvhadr[body], plain.body_bvhadr[body] + plain.body_bvhnum[body])
+    like, at, bounds = plain, geom, plain.bvh_aabb[nodes, 3:]
+    inertia = plain.body_inertia[body] * (mass / plain.body_mass[body])
+    if own != _MESH and (kind != own or not np.array_equal(size, plain.geom_size[geom])):
         like, at = _solid(kind, size, mass), 0
         inertia = like.body_inertia[1]
-    if kind != _MESH:
-        nodes = slice(plain.body_bvhadr[one.body], plain.body_bvhadr[one.body] + plain.body_bvhnum[one.body])
-        changed.geom_size[geom], changed.geom_rbound[geom] = size, like.geom_rbound[at]
-        others = plain.bvh_aabb[nodes, 3:] if plain.body_geomnum[one.body] > 1 else 0.0
-        changed.geom_aabb[geom, 3:] = like.geom_aabb[at, 3:]
-        changed.bvh_aabb[nodes, 3:] = np.maximum(like.geom_aabb[at, 3:], others)
-    changed.geom_type[geom], changed.geom_condim[geom] = kind, condim
-    changed.body_mass[one.body], changed.body_inertia[one.body] = mass, inertia
+        bounds = np.maximum(like.geom_aabb[0, 3:], bounds if plain.body_geomnum[body] > 1 else 0.0)
+    for name in ("geom_type", "geom_size", "geom_rbound", "geom_aabb"):
+        getattr(changed, name)[geom] = getattr(like, name)[at]
+    changed.bvh_aabb[nodes, 3:] = bounds
+    changed.geom_condim[geom] = condim
+    changed.body_mass[body], changed.body_inertia[body] = mass, inertia
     # MuJoCo uses the larger friction of two touching geoms unless one has priority; a drawn friction gets it.
-    drawn = friction != plain.geom_friction[geom, 0]
     changed.geom_friction[geom, 0], changed.geom_friction[geom, 2] = friction, rolling
-    changed.geom_priority[geom] = 1 if drawn else plain.geom_priority[geom]
-
-
-def extents(kind: int, size: F64) -> F64:
-    """Return a geom's lengths along its axes [m], (3,), from `geom_size`; a mesh counts as a box about its origin."""
-    geom = mujoco.mjtGeom
-    if kind in (int(geom.mjGEOM_BOX), _MESH):
-        return 2 * size
-    if kind == int(geom.mjGEOM_SPHERE):
-        return np.full(3, 2 * size[0])
-    if kind == int(geom.mjGEOM_CYLINDER):
-        return 2 * np.array([size[0], size[0], size[1]])
-    if kind == int(geom.mjGEOM_CAPSULE):
-        return 2 * np.array([size[0], size[0], size[1] + size[0]])
-    raise ManipError(
-        f"the first geom of an object is of MuJoCo's type {kind}; expected a box, cylinder, sphere, capsule or mesh"
-    )
+    changed.geom_priority[geom] = plain.geom_priority[geom] or friction != plain.geom_friction[geom, 0]
 
 
 def _solid(kind: int, size: F64, mass: float) -> mujoco.MjModel:

@@ -125,7 +125,8 @@ class World:
 
     def vary(self, variation: F64) -> None:
         """Apply the physics of `variation` (v,) to the model. Raises `MismatchError` for one of another length."""
-        variations.check_size(variation, self.scene.nominal)
+        if len(variation) != (size := len(self.scene.nominal)):
+            raise MismatchError("size of the variation", "the state", len(variation), "the scene", size)
         if variation.tobytes() == self.variation.tobytes():
             return
         self._cache.clear()
@@ -251,8 +252,8 @@ class World:
     def _shape(self, name: str) -> tuple[int, tuple[float, ...]]:
         if name not in self._shapes:
             geom = self.scene.objects[name].geom
-            kind, size, hull = int(self.model.geom_type[geom]), self.model.geom_size[geom], self.hull(name)
-            self._shapes[name] = kind, hull.extents if hull else tuple(variations.extents(kind, size).tolist())
+            kind, half, hull = int(self.model.geom_type[geom]), self.model.geom_aabb[geom, 3:], self.hull(name)
+            self._shapes[name] = kind, hull.extents if hull else tuple((2 * half).tolist())
         return self._shapes[name]
 
     def at_rest(self, name: str) -> bool:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from manip_il.errors import UsageError
 from manip_il.sim.shape import CUBE, LIGHTEST, Shape
-from manip_il.sim.variation import extents
+from manip_il.sim.world import World
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import get_task
@@ -41,8 +41,7 @@ def test_a_text_means_lengths_along_the_shapes_own_axes(text: str, meant: tuple[
 def test_the_model_has_the_lengths_and_the_mass(text: str):
     shape, scene = Shape.parse(text), scene_of("panda", "pick_place", text)
     one = scene.objects["object"]
-    kind, size = int(scene.model.geom_type[one.geom]), scene.model.geom_size[one.geom]
-    assert extents(kind, size) == pytest.approx(shape.lengths)
+    assert World(scene).extents("object") == pytest.approx(shape.lengths)
     spec = mujoco.MjSpec()
     spec.worldbody.add_body(name="solid").add_geom(
         type=scene.model.geom_type[one.geom], size=[*shape.size, 0, 0][:3], density=800
