@@ -140,13 +140,13 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Apply one action (n,) for one control step."""
-        self.begin_step()
         self.advance(action)
         if self.render_mode == "human":
             self.render()
-        return self._observation(), float(self.solved), False, self._step >= self.config.horizon, self._info()
+        reward, info = self.reward, self._info()
+        return self._observation(), reward, False, self._step >= self.config.horizon, info
 
-    def begin_step(self) -> None:
+    def _begin_step(self) -> None:
         """Apply the events of the control step that begins, once: a knock, a perturbation.
 
         A perturbation resets the count of steps within the tolerance.
@@ -160,19 +160,20 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
         Raises `NotFiniteError` for NaN or infinity, `MismatchError` for a wrong shape.
         """
-        world, scene = self.world, self.scene
+        self._begin_step()
+        scene, data = self.scene, self.data
         executed = self._events.action(action, self._step)
         action = scene.actions.clip(executed, self._step)
-        data = world.data
         data.ctrl[scene.arm_ctrl], opening = scene.actions.split(action)
         data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
-        mujoco.mj_step(world.model, data, self.config.physics_steps)
-        world.update()  # otherwise poses are those at the start of the last physics step
-        self.count_step()
+        self.simulate()
         return executed
 
-    def count_step(self) -> None:
-        """Count a control step, and the consecutive ones within the tolerance."""
+    def simulate(self) -> None:
+        """Run one control step with the actuators' commands as they are, as `advance` does once it has set them."""
+        self._begin_step()
+        mujoco.mj_step(self.world.model, self.data, self.config.physics_steps)
+        self.world.update()  # otherwise poses are those at the start of the last physics step
         self._step += 1
         self._begun = False
         self._streak = self._streak + 1 if self.distance() < self.config.tolerance else 0
@@ -225,8 +226,10 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def observe(self) -> Observation:
         """Return what a policy observes now, with the episode's delay and noise; call it once per control step.
 
-        The observation has pictures only if the environment has cameras.
+        What happens to the world at the beginning of the control step, such as a knock, has happened then. The
+        observation has pictures only if the environment has cameras.
         """
+        self._begin_step()
         world = self._measured()
         seen: tuple[dict[str, Picture], dict[str, F32]] = {}, {}
         if self._view:

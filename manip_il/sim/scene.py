@@ -64,7 +64,7 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     """Return the uncompiled scene; world z = 0 is the table's top, x points away from the robot."""
     spec = mujoco.MjSpec.from_file(str(_EMPTY))
     spec.modelname = f"{robot.name}_{task.name}"
-    _add_table(spec, robot)
+    _fit_table(spec, robot)
     arm = arm_spec(robot)
     arm_alone = arm.copy().compile()
     _add_pedestal(spec, arm_alone, robot)
@@ -194,19 +194,17 @@ def _action_space(robot: Robot, joints: list[mujoco._structs._MjModelJointViews]
     return ActionSpace(robot.joint_names, low, high, scale, relative, units)
 
 
-def _add_table(spec: mujoco.MjSpec, robot: Robot) -> None:
-    box, plane = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE
+def _fit_table(spec: mujoco.MjSpec, robot: Robot) -> None:
     table, y = robot.table, robot.workspace.centre[1]
     half = np.array([*table.size, _THICK]) / 2
     middle = [_table_x(robot), y, -half[2]]
-    spec.worldbody.add_geom(
-        name=TABLE, type=box, size=half, pos=middle, material="table", friction=[1.0, 0.005, 0.0001]
-    )
+    top = spec.geom(TABLE)
+    top.size, top.pos = half, middle
     for i, (sx, sy) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        leg = [middle[0] + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -(table.height + _THICK) / 2]
-        size = [0.025, 0.025, round((table.height - _THICK) / 2, 9)]
-        spec.worldbody.add_geom(name=f"leg{i}", type=box, size=size, pos=leg, rgba=[0.35, 0.36, 0.38, 1])
-    spec.worldbody.add_geom(name="floor", type=plane, size=[4, 4, 0.1], pos=[0, 0, -table.height], material="floor")
+        leg = spec.geom(f"leg{i}")
+        leg.size = [0.025, 0.025, round((table.height - _THICK) / 2, 9)]
+        leg.pos = [middle[0] + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -(table.height + _THICK) / 2]
+    spec.geom("floor").pos = [0, 0, -table.height]
 
 
 def _table_x(robot: Robot) -> float:

@@ -127,8 +127,8 @@ def test_a_restored_state_has_the_same_future_in_any_environment(other_has_begun
 def test_a_knock_that_has_happened_does_not_happen_again_in_a_restored_state():
     env = make_env("panda", "lift", conditions=[Condition("knocked", knock=(0.05, 0.05), knock_step=(0, 0))])
     env.reset(seed=0)
-    env.begin_step()
+    env.observe()
     state = env.get_state()
     env.set_state(state)
-    env.begin_step()
+    env.observe()
     np.testing.assert_array_equal(env.get_state().physics, state.physics)
