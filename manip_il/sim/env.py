@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import gymnasium
@@ -26,7 +26,7 @@ from manip_il.sim.shape import ANY
 from manip_il.sim.task import Task, instruction_in
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.window import Window, require_display
-from manip_il.sim.world import Scene, World, once_per_scene
+from manip_il.sim.world import SCENES_KEPT, Scene, World
 
 F32 = NDArray[np.float32]
 _JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
@@ -309,7 +309,7 @@ def environment_state(world: World) -> F32:
     return np.array(numbers, np.float32)
 
 
-@once_per_scene
+@lru_cache(SCENES_KEPT)
 def environment_state_names(scene: Scene) -> tuple[str, ...]:
     """Return the names of the k entries of `environment_state`."""
     world, names = World(scene), list[str]()

@@ -99,11 +99,10 @@ def _thing(rng: np.random.Generator, scene: Scene) -> tuple[Prop, float, float]:
     number = int(rng.integers(len(_KINDS)))
     x, y, z = (rng.uniform(*_HALF, 3) * min(1.0, scene.robot.workspace.half_width / _USUAL)).tolist()
     size, radius, height = (((x, y, z), math.hypot(x, y), z), ((x, z, 0.0), x, z), ((x, 0.0, 0.0), x, x))[number]
-    yaw, (red, green, blue) = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.95, 3)
+    yaw, colour = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.95, 3)
     c, s = math.cos(yaw), math.sin(yaw)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    prop = Prop(int(_KINDS[number]), np.array(size), np.zeros(3), turn, (float(red), float(green), float(blue), 1.0))
-    return prop, radius, height
+    return Prop(int(_KINDS[number]), np.array(size), np.zeros(3), turn, (*colour, 1.0)), radius, height
 
 
 def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> tuple[float, float] | None:

@@ -23,13 +23,12 @@ from manip_il.sim.config import DT_SIM
 from manip_il.sim.rests import LEAST_HEIGHT, LEAST_ROOM, Hull
 from manip_il.sim.task import Fitting, Task
 from manip_il.sim.variation import Object
-from manip_il.sim.world import Scene
+from manip_il.sim.world import SCENES_KEPT, Scene
 
 _EMPTY = Path(__file__).with_name("empty.xml")
 PREFIX = "robot/"  # prefix of the robot's names in a scene
 TABLE = "table"  # name of the table's geom
 _THICK = 0.04  # thickness of the table's top [m]
-SCENES_KEPT = 4  # compiled scenes cached per process: the finest meshes take 64 MB
 _TURN, _SPARE_TURN = 0.1, 0.1  # test rotation of the last joint, to find its direction; margin to its limits [rad]
 SEEN, SEEN_HEIGHT = 0.15, 0.45  # half width and height of the workspace for which `_CAMERAS` are placed [m]
 # Camera positions, from the workspace's middle on the table; height above it of the point that they look at; vertical
