@@ -112,7 +112,7 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
 
 
 def apply(
-    model: mujoco.MjModel,
+    model: Any,
     plain: mujoco.MjModel,
     objects: Mapping[str, Object],
     motors: NDArray[np.int64],
@@ -123,20 +123,16 @@ def apply(
     plain: the model as compiled. motors: actuators of the arm's joints, (arm,). Call `mj_setConst` afterwards: it
     updates what depends on masses.
     """
-    _apply_dynamics(model, plain, motors, variation)
+    # kv changes by the square root of kp's factor, which keeps the damping ratio.
+    damping, gain = part(variation, "joint_damping"), part(variation, "actuator_gain")
+    dofs = plain.jnt_dofadr[plain.actuator_trnid[motors, 0]]
+    model.dof_damping[dofs] = plain.dof_damping[dofs] * damping
+    model.actuator_gainprm[motors, 0] = plain.actuator_gainprm[motors, 0] * gain  # kp
+    model.actuator_biasprm[motors, 1] = plain.actuator_biasprm[motors, 1] * gain  # -kp
+    model.actuator_biasprm[motors, 2] = plain.actuator_biasprm[motors, 2] * np.sqrt(gain)  # -kv
     _, shape = seen_objects(variation)
     for one, row in zip(objects.values(), _objects(variation), strict=True):
         _apply_object(model, plain, one, row, shape)
-
-
-def _apply_dynamics(changed: Any, plain: mujoco.MjModel, motors: NDArray[np.int64], variation: F64) -> None:
-    """Scale the arm's damping and gains, kv by the square root of kp's factor, which keeps the damping ratio."""
-    damping, gain = (float(part(variation, name)[0]) for name in ("joint_damping", "actuator_gain"))
-    dofs = plain.jnt_dofadr[plain.actuator_trnid[motors, 0]]
-    changed.dof_damping[dofs] = plain.dof_damping[dofs] * damping
-    changed.actuator_gainprm[motors, 0] = plain.actuator_gainprm[motors, 0] * gain  # kp
-    changed.actuator_biasprm[motors, 1] = plain.actuator_biasprm[motors, 1] * gain  # -kp
-    changed.actuator_biasprm[motors, 2] = plain.actuator_biasprm[motors, 2] * np.sqrt(gain)  # -kv
 
 
 def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, shape: int | None) -> None:

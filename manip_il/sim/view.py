@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.scene import SEEN, TABLE, camera_id
+from manip_il.sim.scene import TABLE, camera_id
 from manip_il.sim.variation import part, seen_objects
 from manip_il.sim.world import SCENES_KEPT, Scene
 
@@ -86,12 +86,10 @@ class ViewModel:
     def _move_camera(self, name: str, shift: F64, turn: F64) -> None:
         """Move a camera [m], and turn it [deg], in its own frame."""
         camera = camera_id(self.model, name)
-        quat, turned, moved = self.model.cam_quat[camera].copy(), np.empty(4), np.empty(3)
+        quat, moved = self.model.cam_quat[camera], np.empty(3)
         mujoco.mju_rotVecQuat(moved, shift, quat)
         self.model.cam_pos[camera] += moved
-        if angle := float(np.linalg.norm(np.deg2rad(turn))):
-            mujoco.mju_axisAngle2Quat(turned, np.deg2rad(turn) / angle, angle)
-            mujoco.mju_mulQuat(self.model.cam_quat[camera], quat, turned)
+        mujoco.mju_quatIntegrate(quat, np.deg2rad(turn), 1.0)
 
     def _light(self, brightness: float, light_turn: float) -> None:
         """Multiply every lamp by a factor, and turn those fixed in the world about the vertical [deg]."""
@@ -107,7 +105,7 @@ class ViewModel:
 @lru_cache(SCENES_KEPT)
 def _with_few_faces(scene: Scene) -> mujoco.MjModel:
     model = copy.copy(scene.model)
-    simplify_meshes(model, min(1.0, scene.robot.workspace.half_width / SEEN) * _LEAST_CELL)
+    simplify_meshes(model, scene.scale * _LEAST_CELL)
     return model
 
 

@@ -33,6 +33,7 @@ _BESIDE, _NEAR = (-0.02, 0.07), 0.08  # heights and distance at which a hand may
 _MOST_TURNS = 4  # symmetric turns tried in each direction
 _AT_REST = 0.03, 0.5  # speeds below which an object is at rest [m/s], [rad/s]
 SCENES_KEPT = 4  # scenes cached per process, and what is computed from one: the finest meshes take 64 MB
+USUAL = 0.15  # half width of Panda's workspace [m]
 GOAL = "goal"  # the mocap body that marks the goal
 
 
@@ -77,6 +78,16 @@ class Scene:
         """Whether each episode draws the shape of the object; the model as compiled has a cube."""
         shape = getattr(self.task, "shape", None)
         return shape is not None and shape.kind == ANY
+
+    @cached_property
+    def scale(self) -> float:
+        """Width of the workspace as a share of Panda's, at most 1."""
+        return min(1.0, self.robot.workspace.half_width / USUAL)
+
+    @cached_property
+    def furniture(self) -> NDArray[np.int64]:
+        """The geoms of mocap bodies: goal markers and the fixed parts of the task."""
+        return np.flatnonzero(self.model.body_mocapid[self.model.body_rootid[self.model.geom_bodyid]] >= 0)
 
     @property
     def name(self) -> str:
@@ -267,12 +278,8 @@ class World:
     @cached_property
     def _standing(self) -> Mapping[str, NDArray[np.int64]]:
         """For each object, the geoms of furniture and of the other objects."""
-        model, objects = self.scene.model, self.scene.objects
-        furniture = [
-            geom
-            for geom, root in enumerate(model.body_rootid[model.geom_bodyid])
-            if model.body_mocapid[root] >= 0 and model.geom_contype[geom]
-        ]
+        objects, furniture = self.scene.objects, self.scene.furniture
+        furniture = furniture[self.scene.model.geom_contype[furniture] > 0]
         return {
             name: np.array([*furniture, *(one.geom for other, one in objects.items() if other != name)], dtype=np.int64)
             for name in objects
