@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -133,10 +134,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.drawn = drawn
         self._step, self._streak, self._ever, self._begun = 0, 0, False, False
         self._events = Events(self.world, drawn, seed)
-        self._observed: deque[Observation] = deque(maxlen=drawn.get("delay", 0) + 1)
-        self._pictured: deque[tuple[dict[str, Picture], dict[str, F32]]] = deque(
-            maxlen=drawn.get("picture_delay", 0) + 1
-        )
+        self._delay = drawn.get("delay", 0)
+        self._seen: deque[Observation] = deque(maxlen=self._delay + drawn.get("picture_delay", 0) + 1)
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Apply one action (n,) for one control step."""
@@ -220,8 +219,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             self._begin(state.seed)
         self._step, self._streak, self._ever = state.step, state.streak, state.ever
         self._begun = state.begun
-        self._observed.clear()
-        self._pictured.clear()
+        self._seen.clear()
 
     def observe(self) -> Observation:
         """Return what a policy observes now, with the episode's delay and noise; call it once per control step.
@@ -231,16 +229,15 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """
         self._begin_step()
         world = self._measured()
-        seen: tuple[dict[str, Picture], dict[str, F32]] = {}, {}
+        images: dict[str, Picture] = {}
+        keypoints: dict[str, F32] = {}
         if self._view:
             points, images = [*points_in(self.world).values()], self._pictures(self._view)
-            seen = images, projections(self.scene, self._view, np.stack(points)) if points else {}
-        self._pictured.append(seen)
-        (images, keypoints), text = self._pictured[0], self.task_description
-        self._observed.append(
-            Observation(world.measured.astype(np.float32), environment_state(world), images, text, keypoints)
-        )
-        return self._observed[0]
+            keypoints = projections(self.scene, self._view, np.stack(points)) if points else {}
+        state, text = world.measured.astype(np.float32), self.task_description
+        self._seen.append(Observation(state, environment_state(world), images, text, keypoints))
+        late, first = self._seen[-1 - min(self._delay, len(self._seen) - 1)], self._seen[0]
+        return replace(late, images=first.images, keypoints=first.keypoints)
 
     def _measured(self) -> World:
         """The world with noise on joints and object positions, and on all that depends on them."""
@@ -303,10 +300,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
 def environment_state(world: World) -> F32:
     """Return the numbers that the task observes, float32 (k,); lengths in [m]."""
-    numbers: list[float] = []  # for few entries a list is faster than numpy
-    for value in world.scene.task.observe(world).values():
-        numbers += value.tolist() if isinstance(value, np.ndarray) and value.ndim else [float(value)]
-    return np.array(numbers, np.float32)
+    return np.hstack([*world.scene.task.observe(world).values()]).astype(np.float32)
 
 
 @lru_cache(SCENES_KEPT)

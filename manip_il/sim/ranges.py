@@ -20,7 +20,8 @@ def _number(rng: np.random.Generator, range_: Range) -> float:
 
 
 def _whole(rng: np.random.Generator, range_: Range) -> int:
-    return int(rng.integers(*range_, endpoint=True))
+    low, high = range_
+    return int(rng.integers(int(low), int(high), endpoint=True))
 
 
 def _whole_and_seed(rng: np.random.Generator, range_: Range) -> list[int]:
