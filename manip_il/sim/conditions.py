@@ -58,12 +58,13 @@ class Condition:
         task can take [m]; None: only its own.
         Raises `UsageError` if none of the condition's sizes is among them.
         """
-        kept = dict(self.ranges)
-        for name in self.ranges:
-            quantity = RANGES[name]
-            unseen = quantity.changes in ("look", "pictures") and not sees
-            if unseen or (quantity.of_object and not has_object) or (name == "size" and sizes is None):
-                del kept[name]
+        kept = {
+            name: range_
+            for name, range_ in self.ranges.items()
+            if (has_object or not RANGES[name].of_object)
+            and (sees or RANGES[name].changes not in ("look", "pictures"))
+            and (sizes or name != "size")
+        }
         if "size" in kept and sizes is not None:
             kept["size"] = _overlap(self.name, kept["size"], sizes)
         if self.ranges and not kept.keys() - {"knock_step"}:

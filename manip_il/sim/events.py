@@ -124,8 +124,7 @@ def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
     }
 
 
-def open_gripper(world: World) -> None:
-    """Set the gripper's fingers and command to fully open."""
+def _open_gripper(world: World, rng: np.random.Generator) -> None:
     world.gripper.put(world.data, world.gripper.most)
     _settle(world)
 
@@ -137,7 +136,7 @@ KINDS: dict[str, Kind] = {
         change=lambda world, rng: move_object(world, rng, _SHIFT, _DROP),
         needs_object=True,
     ),
-    "open": Kind("gripper wrongly open", change=lambda world, _: open_gripper(world), needs_object=True),
+    "open": Kind("gripper wrongly open", change=_open_gripper, needs_object=True),
     "random": Kind("random action", wrong=random_action),
     "opposite": Kind("opposite action", wrong=opposite_action),
 }

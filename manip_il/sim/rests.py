@@ -66,8 +66,7 @@ class Hull:
         self._hull, self._centre, self._gripper = ConvexHull(points), model.body_ipos[body].copy(), (lowest, widest)
         self._rests: dict[int, Rest] = {}
         self.downs = _resting(self._hull, self._centre)
-        x, y, z = (2 * np.abs(points).max(axis=0)).tolist()
-        self.extents: tuple[float, float, float] = x, y, z
+        self.extents = tuple[float, ...]((2 * np.abs(points).max(axis=0)).tolist())
 
     def rest(self, number: int) -> Rest:
         """Return how the object rests on the side `downs[number]`, computed on first use."""
