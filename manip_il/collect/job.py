@@ -17,7 +17,7 @@ from manip_il.errors import MismatchError
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import Episode, Transition
 from manip_il.option import check_bounds
-from manip_il.sim.conditions import MEASURED, Condition, draw
+from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.shape import draws_shape
 from manip_il.tasks.config import EnvConfig
@@ -72,7 +72,7 @@ class RolloutJob:
             return
         cameras = observed_cameras(self)
         envs = [make_env(self.env, cameras, self.conditions) for _ in range(min(self._lockstep(), len(seeds)))]
-        noise = [one.only(MEASURED) for one in self.conditions]
+        noise = [one.only("sensing") for one in self.conditions]
         branch_env = make_env(self.env, self.cameras, noise) if self.label == "branch" else None
         steps = run_steps(self, envs, seeds)
         for frames in group_rollouts(map(_without_pictures, steps) if self.cameras is None and cameras else steps):
@@ -83,7 +83,7 @@ class RolloutJob:
         """Return the number of environments that run in lockstep in one process."""
         if self.policy is None:
             return 1  # a single environment makes best use of the processor's cache
-        varies = draws_shape(self.env.object) or any(one.changes_model() for one in self.conditions)
+        varies = draws_shape(self.env.object) or any(one.only("model").ranges for one in self.conditions)
         return min(self.batch, OWN_MODELS) if varies or self.env.robot in STOCK else self.batch
 
     def _to_episode(self, frames: list[Transition], branch_env: Environment | None) -> Episode:

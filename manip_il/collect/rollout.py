@@ -116,7 +116,7 @@ def rollout(
     running = [slot for env in envs if (slot := _next_episode(env, waiting, first)) is not None]
     while running:
         for slot in running:
-            _begin_step(slot, labeller)
+            _observe(slot, labeller)
         _choose(running, act, gate, rules.takeover)
         still: list[_Slot] = []
         for slot in running:
@@ -139,9 +139,8 @@ def _next_episode(env: Environment, seeds: Iterator[int], first: State | None) -
     return _Slot(env, seed)
 
 
-def _begin_step(slot: _Slot, labeller: Labeller) -> None:
+def _observe(slot: _Slot, labeller: Labeller) -> None:
     env = slot.env
-    env.begin_step()
     seen, state = env.observe(), env.get_state()
     slot.turn = Turn(slot.seed, slot.step, seen, state, labeller, progress=env.progress, world=env.world)
 

@@ -18,7 +18,7 @@ from manip_il.collect.environments import make_env, make_expert
 from manip_il.collect.query import branch
 from manip_il.mdp import Actor, Label, State, Transition
 from manip_il.seeding import rng_for, stream_seeds
-from manip_il.sim.conditions import MEASURED, PICTURED, Condition, draw
+from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import TakesArgument
@@ -75,8 +75,8 @@ class SceneDrawer:
     """Draws, labels and renders scenes of one environment."""
 
     def __init__(self, config: EnvConfig, scenes: Scenes):
-        noise = [one.only(MEASURED) for one in scenes.conditions]
-        self._env, self._shape = make_env(config, scenes.cameras, noise), config.object
+        noise = [one.only("sensing") for one in scenes.conditions]
+        self._env = make_env(config, scenes.cameras, noise)
         self._has_noise = any(one.ranges for one in noise)
         self._expert = make_expert(config)
         self._scenes = scenes
@@ -108,11 +108,8 @@ class SceneDrawer:
         """Return the state with a randomised appearance, if the environment supports it."""
         if not isinstance(self._env, ManipEnv):  # its appearance is fixed
             return state
-        conditions, shape = self._scenes.conditions, self._shape
-        drawn = draw(conditions, number, shape) if conditions else {}
-        return replace(
-            state, variation=with_drawn(state.variation, {key: drawn[key] for key in PICTURED if key in drawn})
-        )
+        looks = [one.only("look") for one in self._scenes.conditions]
+        return replace(state, variation=with_drawn(state.variation, draw(looks, number)))
 
     def _frame(self, state: State, label: Label, seed: int) -> Transition:
         env, action = self._env, label.action

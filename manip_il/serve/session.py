@@ -112,7 +112,7 @@ def policy_mover(policy: LearnedPolicy, station: Station, cameras: Cameras | Non
 
     def move() -> F64:
         nonlocal seed
-        state, seen = station.env.get_state(), station.env.observe()
+        seen, state = station.env.observe(), station.env.get_state()
         seen.images.update(cameras.images if cameras is not None else {})
         turn = Turn(station.seed, state.step if seed == station.seed else 0, seen, state)
         seed = station.seed

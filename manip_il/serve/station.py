@@ -128,8 +128,6 @@ class Station:
         """Run the simulation until `each_step`, called every control step, returns False."""
         while True:
             self.clock.wait()
-            if self.hand is None:
-                self.env.begin_step()
             if not each_step():
                 return
             self._advance()
@@ -145,9 +143,7 @@ class Station:
         else:
             self._move_leader(self.mover())
             self.follower.command()
-            mujoco.mj_step(env.world.model, env.data, env.config.physics_steps)
-            env.world.update()
-            env.count_step()
+            env.simulate()
             self._solved = self._solved + 1 if env.solved else 0
         self._show()
 
@@ -164,7 +160,7 @@ class Station:
 
     def _show(self) -> None:
         """Update what clients and cameras see."""
-        data, state = self.env.data, self.env.get_state()
+        data, state = self.env.data, replace(self.env.get_state(), begun=True)  # shown without a knock that may follow
         self.seen = data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()
         with self.buses["follower"].lock:
             self.follower.show()

@@ -6,53 +6,18 @@ The drawn values are applied to the model by `variation.py`, to pictures by `vie
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
-
-import numpy as np
 
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.option import NameOrPath
 from manip_il.seeding import rng_for
-from manip_il.sim.config import CAMERAS
+from manip_il.sim.ranges import RANGES, Range
 from manip_il.sim.shape import KINDS, draws_shape
 
-Range = tuple[float, float]
-# Limits of each range.
-_BOUNDS: dict[str, Range] = {
-    "action_noise": (0, 1),
-    "random_actions": (0, 1),
-    "knock": (0, 0.3),
-    "knock_step": (0, 10_000),
-    "joint_noise": (0, 1),
-    "position_noise": (0, 1),
-    "delay": (0, 100),
-    "mass": (0.001, 10),
-    "size": (0.01, 0.09),
-    "friction": (0.01, 10),
-    "joint_damping": (0.01, 100),
-    "actuator_gain": (0.1, 10),
-    "posture": (0, 0.5),
-    "colour": (0, 1),
-    "table": (0, 1),
-    "camera_shift": (0, 1),
-    "camera_turn": (0, 90),
-    "brightness": (0.1, 3),
-    "light_turn": (-180, 180),
-    "clutter": (0, 12),
-    "picture_delay": (0, 100),
-}
-_WHOLE = ("knock_step", "delay", "picture_delay", "clutter")
-_SEEDS = 2**31  # number of clutter seeds; a state stores each exactly, as a float
 _KNOCK_STEP = (5, 24)  # default for a condition with a knock
-_BODY = ("mass", "size", "friction")  # the object's physics
-_MODEL = (*_BODY, "joint_damping", "actuator_gain")
-_OBJECT = ("knock", "colour", "position_noise", *_BODY)
-PICTURED = ("colour", "table", "camera_shift", "camera_turn", "brightness", "light_turn", "clutter")  # only in pictures
-_SEEN = (*PICTURED, "picture_delay")
-MEASURED = ("joint_noise", "position_noise")
 
 
 @dataclass(frozen=True, init=False)
@@ -83,7 +48,7 @@ class Condition:
         if "knock" in ranges:
             ranges = {"knock_step": _KNOCK_STEP} | ranges
         ranges = {one: _range(name, one, range_) for one, range_ in ranges.items()}
-        kept = {one: ranges[one] for one in _BOUNDS if one in ranges and (one != "knock_step" or "knock" in ranges)}
+        kept = {one: ranges[one] for one in RANGES if one in ranges and (one != "knock_step" or "knock" in ranges)}
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
     def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
@@ -93,21 +58,23 @@ class Condition:
         task can take [m]; None: only its own.
         Raises `UsageError` if none of the condition's sizes is among them.
         """
-        dropped = {*(() if has_object else _OBJECT), *(() if sees else _SEEN), *(() if sizes else ("size",))}
-        kept = {name: range_ for name, range_ in self.ranges.items() if name not in dropped}
+        kept = {
+            name: range_
+            for name, range_ in self.ranges.items()
+            if (has_object or not RANGES[name].of_object)
+            and (sees or RANGES[name].changes not in ("look", "pictures"))
+            and (sizes or name != "size")
+        }
         if "size" in kept and sizes is not None:
             kept["size"] = _overlap(self.name, kept["size"], sizes)
         if self.ranges and not kept.keys() - {"knock_step"}:
             return None
         return Condition(self.name, **kept)
 
-    def only(self, names: Collection[str]) -> Condition:
-        """Return the condition with only the named ranges."""
-        return Condition(self.name, **{name: range_ for name, range_ in self.ranges.items() if name in names})
-
-    def changes_model(self) -> bool:
-        """Return whether the condition changes the physics of the object or the arm."""
-        return not self.ranges.keys().isdisjoint(_MODEL)
+    def only(self, changes: str) -> Condition:
+        """Return the condition with only the ranges that change one thing, see `Quantity.changes`."""
+        kept = {name: range_ for name, range_ in self.ranges.items() if RANGES[name].changes == changes}
+        return Condition(self.name, **kept)
 
     def draw(self, seed: int) -> dict[str, Any]:
         """Return the values drawn for the episode of a seed, by the names of the ranges and in their units.
@@ -115,7 +82,9 @@ class Condition:
         Each value has a random stream of its own, so that adding a range leaves the other values unchanged.
         camera_shift and camera_turn have one vector (3,) per camera, in the camera's own frame.
         """
-        return {name: _draw(name, range_, rng_for(seed, f"condition {name}")) for name, range_ in self.ranges.items()}
+        return {
+            name: RANGES[name].draw(rng_for(seed, f"condition {name}"), range_) for name, range_ in self.ranges.items()
+        }
 
     def to_json(self) -> dict[str, Any]:
         """Return name and ranges as plain JSON values."""
@@ -154,36 +123,19 @@ def words(range_: Range) -> str:
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
-def _draw(name: str, range_: Range, rng: np.random.Generator) -> Any:
-    if name in _WHOLE:
-        count = int(rng.integers(int(range_[0]), int(range_[1]), endpoint=True))
-        return [count, int(rng.integers(_SEEDS))] if name == "clutter" else count
-    if name in ("colour", "table"):
-        return [float(value) for value in rng.uniform(range_[0], range_[1], 3)]
-    if name in ("camera_shift", "camera_turn"):
-        return {camera: _vector(rng, range_) for camera in CAMERAS}
-    return float(rng.uniform(*range_))
-
-
-def _vector(rng: np.random.Generator, lengths: Range) -> list[float]:
-    """A vector of random length in a uniformly random direction."""
-    direction = rng.normal(size=3)
-    return [float(value) for value in rng.uniform(*lengths) * direction / np.linalg.norm(direction)]
-
-
 def _range(condition: str, name: str, given: Any) -> Range:
     """A range as a tuple, from what Python or YAML gives: a pair or a number."""
-    if name not in _BOUNDS:
-        raise UnknownName(f"key in {condition}:", name[: checks.LONGEST_NAME], _BOUNDS)
+    if name not in RANGES:
+        raise UnknownName(f"key in {condition}:", name[: checks.LONGEST_NAME], RANGES)
     what, ends = f"{condition}: {name}", given if isinstance(given, list | tuple) else (given, given)
     try:
         low, high = (checks.number(what, end) for end in ends)
     except (ManipError, ValueError):
         raise UsageError(f"{what} is {checks.shorten(given)}; expected a number, or [low, high]") from None
-    least, most = _BOUNDS[name]
+    least, most = RANGES[name].bounds
     if not least <= low <= high <= most:
         raise UsageError(f"{what} is [{low}, {high}]; expected low <= high, both from {least} to {most}")
-    if name in _WHOLE and (low % 1 or high % 1):
+    if RANGES[name].is_whole and (low % 1 or high % 1):
         raise UsageError(f"{what} is [{low}, {high}]; expected whole numbers")
     return given if isinstance(given, tuple) else (low, high)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import gymnasium
@@ -26,7 +27,7 @@ from manip_il.sim.shape import ANY
 from manip_il.sim.task import Task, instruction_in
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.window import Window, require_display
-from manip_il.sim.world import Scene, World, once_per_scene
+from manip_il.sim.world import SCENES_KEPT, Scene, World
 
 F32 = NDArray[np.float32]
 _JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
@@ -133,20 +134,18 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.drawn = drawn
         self._step, self._streak, self._ever, self._begun = 0, 0, False, False
         self._events = Events(self.world, drawn, seed)
-        self._observed: deque[Observation] = deque(maxlen=drawn.get("delay", 0) + 1)
-        self._pictured: deque[tuple[dict[str, Picture], dict[str, F32]]] = deque(
-            maxlen=drawn.get("picture_delay", 0) + 1
-        )
+        self._delay = drawn.get("delay", 0)
+        self._seen: deque[Observation] = deque(maxlen=self._delay + drawn.get("picture_delay", 0) + 1)
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Apply one action (n,) for one control step."""
-        self.begin_step()
         self.advance(action)
         if self.render_mode == "human":
             self.render()
-        return self._observation(), float(self.solved), False, self._step >= self.config.horizon, self._info()
+        reward, info = self.reward, self._info()
+        return self._observation(), reward, False, self._step >= self.config.horizon, info
 
-    def begin_step(self) -> None:
+    def _begin_step(self) -> None:
         """Apply the events of the control step that begins, once: a knock, a perturbation.
 
         A perturbation resets the count of steps within the tolerance.
@@ -160,19 +159,20 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
         Raises `NotFiniteError` for NaN or infinity, `MismatchError` for a wrong shape.
         """
-        world, scene = self.world, self.scene
+        self._begin_step()
+        scene, data = self.scene, self.data
         executed = self._events.action(action, self._step)
         action = scene.actions.clip(executed, self._step)
-        data = world.data
         data.ctrl[scene.arm_ctrl], opening = scene.actions.split(action)
         data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
-        mujoco.mj_step(world.model, data, self.config.physics_steps)
-        world.update()  # otherwise poses are those at the start of the last physics step
-        self.count_step()
+        self.simulate()
         return executed
 
-    def count_step(self) -> None:
-        """Count a control step, and the consecutive ones within the tolerance."""
+    def simulate(self) -> None:
+        """Run one control step with the actuators' commands as they are, as `advance` does once it has set them."""
+        self._begin_step()
+        mujoco.mj_step(self.world.model, self.data, self.config.physics_steps)
+        self.world.update()  # otherwise poses are those at the start of the last physics step
         self._step += 1
         self._begun = False
         self._streak = self._streak + 1 if self.distance() < self.config.tolerance else 0
@@ -219,25 +219,25 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             self._begin(state.seed)
         self._step, self._streak, self._ever = state.step, state.streak, state.ever
         self._begun = state.begun
-        self._observed.clear()
-        self._pictured.clear()
+        self._seen.clear()
 
     def observe(self) -> Observation:
         """Return what a policy observes now, with the episode's delay and noise; call it once per control step.
 
-        The observation has pictures only if the environment has cameras.
+        What happens to the world at the beginning of the control step, such as a knock, has happened then. The
+        observation has pictures only if the environment has cameras.
         """
+        self._begin_step()
         world = self._measured()
-        seen: tuple[dict[str, Picture], dict[str, F32]] = {}, {}
+        images: dict[str, Picture] = {}
+        keypoints: dict[str, F32] = {}
         if self._view:
             points, images = [*points_in(self.world).values()], self._pictures(self._view)
-            seen = images, projections(self.scene, self._view, np.stack(points)) if points else {}
-        self._pictured.append(seen)
-        (images, keypoints), text = self._pictured[0], self.task_description
-        self._observed.append(
-            Observation(world.measured.astype(np.float32), environment_state(world), images, text, keypoints)
-        )
-        return self._observed[0]
+            keypoints = projections(self.scene, self._view, np.stack(points)) if points else {}
+        state, text = world.measured.astype(np.float32), self.task_description
+        self._seen.append(Observation(state, environment_state(world), images, text, keypoints))
+        late, first = self._seen[-1 - min(self._delay, len(self._seen) - 1)], self._seen[0]
+        return replace(late, images=first.images, keypoints=first.keypoints)
 
     def _measured(self) -> World:
         """The world with noise on joints and object positions, and on all that depends on them."""
@@ -300,13 +300,10 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
 def environment_state(world: World) -> F32:
     """Return the numbers that the task observes, float32 (k,); lengths in [m]."""
-    numbers: list[float] = []  # for few entries a list is faster than numpy
-    for value in world.scene.task.observe(world).values():
-        numbers += value.tolist() if isinstance(value, np.ndarray) and value.ndim else [float(value)]
-    return np.array(numbers, np.float32)
+    return np.hstack([*world.scene.task.observe(world).values()]).astype(np.float32)
 
 
-@once_per_scene
+@lru_cache(SCENES_KEPT)
 def environment_state_names(scene: Scene) -> tuple[str, ...]:
     """Return the names of the k entries of `environment_state`."""
     world, names = World(scene), list[str]()

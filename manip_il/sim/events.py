@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.seeding import rng_for
-from manip_il.sim.conditions import Condition
+from manip_il.sim.conditions import Condition, merged
 from manip_il.sim.task import Task, objects_in
 from manip_il.sim.world import World
 
@@ -124,8 +124,7 @@ def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
     }
 
 
-def open_gripper(world: World) -> None:
-    """Set the gripper's fingers and command to fully open."""
+def _open_gripper(world: World, rng: np.random.Generator) -> None:
     world.gripper.put(world.data, world.gripper.most)
     _settle(world)
 
@@ -137,7 +136,7 @@ KINDS: dict[str, Kind] = {
         change=lambda world, rng: move_object(world, rng, _SHIFT, _DROP),
         needs_object=True,
     ),
-    "open": Kind("gripper wrongly open", change=lambda world, _: open_gripper(world), needs_object=True),
+    "open": Kind("gripper wrongly open", change=_open_gripper, needs_object=True),
     "random": Kind("random action", wrong=random_action),
     "opposite": Kind("opposite action", wrong=opposite_action),
 }
@@ -163,9 +162,8 @@ class Perturbation(Condition):
 
 
 def standard_in(varied: Sequence[Condition]) -> Condition:
-    """Return `STANDARD` with the ranges of other conditions added; `STANDARD` itself if they have none."""
-    ranges = {name: range_ for condition in varied for name, range_ in condition.ranges.items()}
-    return Condition(STANDARD.name, **{**ranges, **STANDARD.ranges}) if ranges else STANDARD
+    """Return `STANDARD` with the ranges of other conditions added."""
+    return Condition(STANDARD.name, **merged([*varied, STANDARD]).ranges)
 
 
 STANDARD = Condition("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), knock_step=(5, 24))
@@ -175,15 +173,8 @@ class Events:
     """Events of one episode: `drawn` says which, how strong and when; directions and noise are drawn from the seed."""
 
     def __init__(self, world: World, drawn: Mapping[str, Any], seed: int):
-        self._world = world
-        self._seed = seed
-        self._share = drawn.get("action_noise", 0.0)
-        self._random = drawn.get("random_actions", 0.0)
-        self._knock = drawn.get("knock", 0.0)
-        self._knock_step = drawn.get("knock_step", -1)
-        self._name = next((name for name in drawn if name in KINDS), "")
-        self._kind = KINDS.get(self._name)
-        self._kind_step = drawn.get(self._name)
+        self._world, self._drawn, self._seed = world, drawn, seed
+        self._kinds = {moment: (name, KINDS[name]) for name, moment in drawn.items() if name in KINDS}
 
     def before(self, step: int) -> bool:
         """Apply the events of a step to the world; return whether a perturbation changed it.
@@ -191,13 +182,14 @@ class Events:
         A perturbation that finds no free place, or that changes nothing (fingers already open), leaves the world as
         it was, bit for bit.
         """
-        world = self._world
-        if step == self._knock_step:
-            move_object(world, rng_for(self._seed, "knock"), (self._knock, self._knock))
-        if self._kind is None or self._kind.change is None or step != self._kind_step:
+        world, drawn = self._world, self._drawn
+        if step == drawn.get("knock_step"):
+            move_object(world, rng_for(self._seed, "knock"), (drawn["knock"], drawn["knock"]))
+        name, kind = self._kinds.get(step, ("", None))
+        if kind is None or kind.change is None:
             return False
         before, qpos = world.physics(), world.data.qpos.copy()
-        self._kind.change(world, self._kind_rng())
+        kind.change(world, rng_for(self._seed, f"perturbation {name}"))
         if np.abs(world.data.qpos - qpos).max() >= _NOTICEABLE:
             return True
         world.restore(before, world.variation)
@@ -205,18 +197,16 @@ class Events:
 
     def action(self, action: F64, step: int) -> F64:
         """Return the action (n,) that is executed at a step: `action`, with noise or replaced if an event says so."""
-        if self._kind is not None and self._kind.wrong is not None and step == self._kind_step:
-            return self._kind.wrong(action, self._world, self._kind_rng())
-        if self._random:
+        name, kind = self._kinds.get(step, ("", None))
+        if kind is not None and kind.wrong is not None:
+            return kind.wrong(action, self._world, rng_for(self._seed, f"perturbation {name}"))
+        if share := self._drawn.get("random_actions"):
             rng = rng_for(self._seed, "random actions", step)
-            if rng.uniform() < self._random:
+            if rng.uniform() < share:
                 return random_action(action, self._world, rng)
-        if self._share:
-            return noisy(action, self._world, self._share, rng_for(self._seed, "action noise", step))
+        if spread := self._drawn.get("action_noise"):
+            return noisy(action, self._world, spread, rng_for(self._seed, "action noise", step))
         return action
-
-    def _kind_rng(self) -> np.random.Generator:
-        return rng_for(self._seed, f"perturbation {self._name}")
 
 
 def _settle(world: World) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import product
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.sim.world import Scene, World, once_per_scene
+from manip_il.sim.world import SCENES_KEPT, Scene, World
 
 F64 = NDArray[np.float64]
 _SIGNS = np.array(list(product((-1, 1), repeat=3)))  # signs of a box's corners
@@ -34,7 +35,7 @@ def points_in(world: World) -> dict[str, F64]:
     return found
 
 
-@once_per_scene
+@lru_cache(SCENES_KEPT)
 def point_names(scene: Scene) -> tuple[str, ...]:
     """Return the names of `points_in`, in its order."""
     world = World(scene)

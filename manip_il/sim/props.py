@@ -26,7 +26,6 @@ _ACROSS = (
 _STAND = (0.10, 0.55, 0.28, 1.0)  # the stand's colour
 _KINDS = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
 _HALF = (0.012, 0.04)  # range of a clutter object's half lengths, for a workspace as large as Panda's [m]
-_USUAL = 0.15  # half width of Panda's workspace [m]
 _BESIDE, _WITHIN = 0.06, 0.24  # least and greatest distance of clutter from the workspace's edge [m]
 _FROM_BASE = 0.18  # least horizontal distance of clutter from the robot's first joint [m]
 _DRAWS = 50  # draws of a clutter object's place before it is left out
@@ -65,7 +64,7 @@ def _stand(scene: Scene, data: mujoco.MjData) -> list[Prop]:
     x, y, z = data.mocap_pos[scene.model.body_mocapid[body]].tolist()
     if z < 0:
         return []
-    scale = min(1.0, scene.robot.workspace.half_width / _USUAL)
+    scale = scene.scale
     largest = max((float(scene.model.geom_rbound[one.geom]) for one in scene.objects.values()), default=_GOAL * scale)
     if z <= _SHORTEST:
         return [_cylinder((x, y, _THIN / 2), _UP, _FOOT * largest, _THIN)]
@@ -81,7 +80,8 @@ def _cylinder(at: tuple[float, float, float], rotation: F64, radius: float, leng
 def _clutter(scene: Scene, data: mujoco.MjData, count: int, seed: int) -> list[Prop]:
     if not count:
         return []
-    rng, taken = rng_for(seed, "clutter"), _furniture(scene, data)
+    rng, radii = rng_for(seed, "clutter"), scene.model.geom_rbound
+    taken = [(*data.geom_xpos[geom][:2].tolist(), float(radii[geom])) for geom in scene.furniture]
     found: list[Prop] = []
     for _ in range(count):
         prop, radius, height = _thing(rng, scene)
@@ -97,13 +97,12 @@ def _clutter(scene: Scene, data: mujoco.MjData, count: int, seed: int) -> list[P
 def _thing(rng: np.random.Generator, scene: Scene) -> tuple[Prop, float, float]:
     """A box, cylinder or ball of any colour, turned about the vertical; its radius from above, half its height [m]."""
     number = int(rng.integers(len(_KINDS)))
-    x, y, z = (rng.uniform(*_HALF, 3) * min(1.0, scene.robot.workspace.half_width / _USUAL)).tolist()
+    x, y, z = (rng.uniform(*_HALF, 3) * scene.scale).tolist()
     size, radius, height = (((x, y, z), math.hypot(x, y), z), ((x, z, 0.0), x, z), ((x, 0.0, 0.0), x, x))[number]
-    yaw, (red, green, blue) = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.95, 3)
+    yaw, colour = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.95, 3)
     c, s = math.cos(yaw), math.sin(yaw)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    prop = Prop(int(_KINDS[number]), np.array(size), np.zeros(3), turn, (float(red), float(green), float(blue), 1.0))
-    return prop, radius, height
+    return Prop(int(_KINDS[number]), np.array(size), np.zeros(3), turn, (*colour, 1.0)), radius, height
 
 
 def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> tuple[float, float] | None:
@@ -116,10 +115,3 @@ def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> tuple
     at = space.centre[0] + x, space.centre[1] + y
     base = data.xanchor[scene.shoulder]
     return at if math.dist(at, base[:2].tolist()) > _FROM_BASE else None
-
-
-def _furniture(scene: Scene, data: mujoco.MjData) -> list[tuple[float, float, float]]:
-    """x, y and radius [m] of every fixed part of the task, seen from above."""
-    model = scene.model
-    fixed = [geom for geom in range(model.ngeom) if model.body_mocapid[model.body_rootid[model.geom_bodyid[geom]]] >= 0]
-    return [(*data.geom_xpos[geom][:2].tolist(), float(model.geom_rbound[geom])) for geom in fixed]

@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from manip_il.caching import cached_per_thread
 from manip_il.errors import RenderError
@@ -148,7 +149,7 @@ class _Renderer:
         view = mujoco.MjrRect(0, 0, width, height)
         mujoco.mjr_render(view, self._scene, self._context)
         mujoco.mjr_readPixels(fine, None, view, self._context)
-        return _coarser(fine[::-1])  # OpenGL counts rows from below
+        return np.asarray(Image.fromarray(fine).reduce(_FINER))[::-1].copy()  # OpenGL counts rows from below
 
     def project(self, camera: str, points: NDArray[np.float64], aspect: float) -> NDArray[np.float32]:
         number = self._cameras[camera]
@@ -158,9 +159,3 @@ class _Renderer:
         found = np.stack([0.5 + x / (2 * half * aspect), 0.5 - y / (2 * half), np.ones_like(x)], axis=1)
         inside = ((found[:, :2] >= 0) & (found[:, :2] <= 1)).all(axis=1) & np.isfinite(ahead)
         return np.where(inside[:, None], found, 0.0).astype(np.float32)
-
-
-def _coarser(fine: NDArray[np.uint8]) -> Picture:
-    """Means of blocks of 2 x 2 pixels, rounded."""
-    sums = np.add(fine[::2], fine[1::2], dtype=np.uint16)
-    return ((sums[:, ::2] + sums[:, 1::2] + 2) // 4).astype(np.uint8)

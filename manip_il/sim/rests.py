@@ -66,8 +66,7 @@ class Hull:
         self._hull, self._centre, self._gripper = ConvexHull(points), model.body_ipos[body].copy(), (lowest, widest)
         self._rests: dict[int, Rest] = {}
         self.downs = _resting(self._hull, self._centre)
-        x, y, z = (2 * np.abs(points).max(axis=0)).tolist()
-        self.extents: tuple[float, float, float] = x, y, z
+        self.extents = tuple[float, ...]((2 * np.abs(points).max(axis=0)).tolist())
 
     def rest(self, number: int) -> Rest:
         """Return how the object rests on the side `downs[number]`, computed on first use."""
@@ -121,12 +120,12 @@ def _rest(hull: ConvexHull, centre: F64, down: F64, lowest: float, widest: float
     axes = np.array([first, np.cross(-down, first)])  # horizontal
     heights = -(hull.points - centre) @ down
     height, tall = float(-heights.min()), float(np.ptp(heights))
-    at = max(lowest, tall - DEEPEST, min(height, tall / 2))  # height of the hand over the table
     flat, turns = (hull.points - centre) @ axes.T, _turns(hull, axes)
-    ways, any_yaw = _ways(_all_ways(hull, heights + height, flat, at - lowest, turns), widest - LEAST_ROOM)
-    if min(way.slope for way in ways) > _SLOPE and at > max(lowest, tall - DEEPEST):  # it narrows upwards: grasp lower
-        at = max(lowest, tall - DEEPEST)
+    deepest = max(lowest, tall - DEEPEST)
+    for at in (max(deepest, min(height, tall / 2)), deepest):  # heights of the hand over the table
         ways, any_yaw = _ways(_all_ways(hull, heights + height, flat, at - lowest, turns), widest - LEAST_ROOM)
+        if min(way.slope for way in ways) <= _SLOPE:  # else it narrows upwards: grasp lower
+            break
     turned = np.array([[math.cos(way.turn), math.sin(way.turn)] for way in ways])
     across = turned @ axes
     middle = centre + (at - height) * -down + np.array([way.middle for way in ways])[:, None] * across

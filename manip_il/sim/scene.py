@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -22,21 +23,20 @@ from manip_il.sim.config import DT_SIM
 from manip_il.sim.rests import LEAST_HEIGHT, LEAST_ROOM, Hull
 from manip_il.sim.task import Fitting, Task
 from manip_il.sim.variation import Object
-from manip_il.sim.world import Scene
+from manip_il.sim.world import SCENES_KEPT, USUAL, Scene
 
+_EMPTY = Path(__file__).with_name("empty.xml")
 PREFIX = "robot/"  # prefix of the robot's names in a scene
 TABLE = "table"  # name of the table's geom
 _THICK = 0.04  # thickness of the table's top [m]
-SCENES_KEPT = 4  # compiled scenes cached per process: the finest meshes take 64 MB
 _TURN, _SPARE_TURN = 0.1, 0.1  # test rotation of the last joint, to find its direction; margin to its limits [rad]
-SEEN, SEEN_HEIGHT = 0.15, 0.45  # half width and height of the workspace for which `_CAMERAS` are placed [m]
+_SEEN_HEIGHT = 0.45  # height of the workspace for which `_CAMERAS` are placed; its half width is `USUAL` [m]
 # Camera positions, from the workspace's middle on the table; height above it of the point that they look at; vertical
 # field of view.
 _CAMERAS = {"front": (0.80, -0.15, 0.55), "side": (-0.05, -0.80, 0.50)}  # [m]
 _LOOK_AT, _FIELD = 0.17, 42.0  # [m], [deg]
 _ON_TABLE = 0.02  # a robot stands on the table only if its lowest point is this near to the table's top [m]
 _PEDESTAL = 0.13  # half the pedestal's width [m]
-_SHADOW_SIZE = 1024  # side of the shadow map [pixels]: the main cost on a software renderer
 
 
 @lru_cache(SCENES_KEPT)
@@ -61,13 +61,9 @@ def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
 
 def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     """Return the uncompiled scene; world z = 0 is the table's top, x points away from the robot."""
-    spec = mujoco.MjSpec()
+    spec = mujoco.MjSpec.from_file(str(_EMPTY))
     spec.modelname = f"{robot.name}_{task.name}"
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10  # holds the cube: with the pyramidal default it creeps out of the hand
-    _add_look(spec)
-    _add_table(spec, robot)
+    _fit_table(spec, robot)
     arm = arm_spec(robot)
     arm_alone = arm.copy().compile()
     _add_pedestal(spec, arm_alone, robot)
@@ -92,6 +88,7 @@ def camera_id(model: mujoco.MjModel, name: str) -> int:
 
 def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
     joints = [model.joint(PREFIX + name) for name in robot.joints]
+    arm_q = np.array([joint.qposadr[0] for joint in joints], dtype=np.int64)
     objects = _objects(model)
     gripper = Gripper(robot, model, PREFIX)
     hulls = {
@@ -107,42 +104,40 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
         gripper=gripper,
         actions=_action_space(robot, joints, gripper),
         objects=objects,
-        arm_q=np.array([joint.qposadr[0] for joint in joints], dtype=np.int64),
+        arm_q=arm_q,
         arm_ctrl=np.array([model.actuator(PREFIX + name).id for name in robot.joints], dtype=np.int64),
         ee_site=model.site(PREFIX + "ee").id,
         shoulder=joints[0].id,
-        yaws=_yaws(robot, model, joints[-1]),
+        yaws=_yaws(robot, model, joints, arm_q),
         nominal=variation.nominal(model, objects),
         hulls=hulls,
     )
 
 
-def _yaws(robot: Robot, model: mujoco.MjModel, roll: Any) -> tuple[float, float]:
+def _yaws(robot: Robot, model: mujoco.MjModel, joints: list[Any], arm_q: Any) -> tuple[float, float]:
     """Least and greatest yaw to which a robot's last joint turns the hand, relative to `yaw_ahead` [rad]."""
-    if not robot.faces_ahead or not roll.limited[0]:
+    if not robot.faces_ahead or not joints[-1].limited[0]:
         return -np.inf, np.inf
     data, yaws = mujoco.MjData(model), []
     for turn in (0.0, _TURN):
-        for name, value in zip(robot.joints, robot.home, strict=True):
-            data.joint(PREFIX + name).qpos[0] = value
-        data.joint(roll.name).qpos[0] += turn
+        data.qpos[arm_q] = robot.home
+        data.qpos[arm_q[-1]] += turn
         mujoco.mj_kinematics(model, data)
         ee = data.site(PREFIX + "ee")
-        ahead = yaw_ahead(robot, data.xanchor[model.joint(PREFIX + robot.joints[0]).id], ee.xpos)
+        ahead = yaw_ahead(robot, data.xanchor[joints[0].id], ee.xpos)
         yaws.append(math.remainder(angle_across(ee.xmat.reshape(3, 3)) - ahead, 2 * np.pi))
     sign = np.sign(math.remainder(yaws[1] - yaws[0], 2 * np.pi))
-    ends = [yaws[0] + sign * (end - robot.home[-1]) for end in roll.range]
+    ends = [yaws[0] + sign * (end - robot.home[-1]) for end in joints[-1].range]
     return min(ends) + _SPARE_TURN, max(ends) - _SPARE_TURN
 
 
 def _objects(model: mujoco.MjModel) -> dict[str, Object]:
     """The free bodies, by name, in the model's order."""
     objects = {}
-    for joint in range(model.njnt):
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
-            body = int(model.jnt_bodyid[joint])
-            name, geom = model.body(body).name, int(model.body_geomadr[body])
-            objects[name] = Object(name, body, geom, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
+    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        body = int(model.jnt_bodyid[joint])
+        name, geom = model.body(body).name, int(model.body_geomadr[body])
+        objects[name] = Object(name, body, geom, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
     return objects
 
 
@@ -168,8 +163,12 @@ def _check_objects(
                 "free), "
             )
         else:  # width between the fingers if the object lies on its worst side
-            kind, size = int(model.geom_type[objects[name].geom]), model.geom_size[objects[name].geom]
-            lengths = variation.extents(kind, size)
+            kind, lengths = int(model.geom_type[objects[name].geom]), 2 * model.geom_aabb[objects[name].geom, 3:]
+            if kind not in variation.KINDS:
+                raise UsageError(
+                    f"task {task.name}: the first geom of {name!r} is of MuJoCo's type {kind}; expected "
+                    f"{', '.join(variation.GEOMS)} or mesh"
+                )
             width = float(np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0])
             fits = width < gripper.most
         if not fits:
@@ -179,11 +178,11 @@ def _check_objects(
             )
 
 
-def _action_space(robot: Robot, joints: list[mujoco._structs._MjModelJointViews], gripper: Gripper) -> ActionSpace:
+def _action_space(robot: Robot, joints: list[Any], gripper: Gripper) -> ActionSpace:
     limits = np.array([joint.range if joint.limited[0] else [-np.inf, np.inf] for joint in joints])
     low, high = np.vstack([limits, [gripper.least, gripper.most]]).T
-    scale = np.array([robot.max_joint_step] * len(joints) + [gripper.most - gripper.least])
-    relative, units = np.array([True] * len(joints) + [False]), None
+    scale = np.append(np.full(len(joints), robot.max_joint_step), gripper.most - gripper.least)
+    relative, units = np.arange(len(scale)) < len(joints), None
     if robot.lerobot is not None:
         openings, driven = gripper.driven
         units = ServoUnits(openings, robot.lerobot.percent(driven))
@@ -193,47 +192,17 @@ def _action_space(robot: Robot, joints: list[mujoco._structs._MjModelJointViews]
     return ActionSpace(robot.joint_names, low, high, scale, relative, units)
 
 
-def _add_look(spec: mujoco.MjSpec) -> None:
-    spec.visual.headlight.ambient = [0.32, 0.32, 0.34]
-    spec.visual.headlight.diffuse = [0.22, 0.22, 0.22]
-    spec.visual.headlight.specular = [0.0, 0.0, 0.0]
-    spec.visual.quality.shadowsize = _SHADOW_SIZE
-    spec.visual.map.znear = 0.01
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.84, 0.88, 0.92],
-        rgb2=[0.55, 0.62, 0.70],
-        width=256,
-        height=256 * 6,
-    )
-    spec.add_material(name="floor", rgba=[0.80, 0.83, 0.86, 1], specular=0.0, emission=0.25)
-    spec.add_material(name="table", rgba=[0.80, 0.70, 0.57, 1], specular=0.15, shininess=0.3)
-    spec.worldbody.add_light(
-        pos=[0.9, -0.9, 1.8],
-        dir=[-0.35, 0.75, -1.5],
-        diffuse=[0.62, 0.60, 0.56],
-        specular=[0.2, 0.2, 0.2],
-        castshadow=True,
-    )
-    spec.worldbody.add_light(pos=[-0.5, 1.2, 1.5], dir=[0.6, -0.7, -1.0], diffuse=[0.2, 0.22, 0.26], castshadow=False)
-
-
-def _add_table(spec: mujoco.MjSpec, robot: Robot) -> None:
-    box, plane = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE
+def _fit_table(spec: mujoco.MjSpec, robot: Robot) -> None:
     table, y = robot.table, robot.workspace.centre[1]
     half = np.array([*table.size, _THICK]) / 2
     middle = [_table_x(robot), y, -half[2]]
-    spec.worldbody.add_geom(
-        name=TABLE, type=box, size=half, pos=middle, material="table", friction=[1.0, 0.005, 0.0001]
-    )
+    top = spec.geom(TABLE)
+    top.size, top.pos = half, middle
     for i, (sx, sy) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        leg = [middle[0] + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -(table.height + _THICK) / 2]
-        size = [0.025, 0.025, round((table.height - _THICK) / 2, 9)]
-        spec.worldbody.add_geom(name=f"leg{i}", type=box, size=size, pos=leg, rgba=[0.35, 0.36, 0.38, 1])
-    spec.worldbody.add_geom(name="floor", type=plane, size=[4, 4, 0.1], pos=[0, 0, -table.height], material="floor")
+        leg = spec.geom(f"leg{i}")
+        leg.size = [0.025, 0.025, round((table.height - _THICK) / 2, 9)]
+        leg.pos = [middle[0] + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -(table.height + _THICK) / 2]
+    spec.geom("floor").pos = [0, 0, -table.height]
 
 
 def _table_x(robot: Robot) -> float:
@@ -244,10 +213,10 @@ def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> N
     """Add a pedestal from the floor to the robot's lowest point, unless the robot stands on the floor or the table."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    touching = [i for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i]]
-    fixed = [i for i in range(model.ngeom) if model.body_weldid[model.geom_bodyid[i]] == 0]
-    root = [i for i in touching if i in fixed]
-    placed = [outline(model, data, i) for i in root or fixed or touching]
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    touching = (model.geom_contype | model.geom_conaffinity) > 0
+    stand = next(geoms for geoms in (fixed & touching, fixed, touching) if geoms.any())
+    placed = [outline(model, data, geom) for geom in np.flatnonzero(stand)]
     middles = np.array([(one.max(axis=0) + one.min(axis=0))[:2] / 2 for one in placed])
     lowest = min(float(one[:, 2].min()) for one in placed)
     floor = -robot.table.height
@@ -267,7 +236,7 @@ def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> N
 
 def _add_cameras(spec: mujoco.MjSpec, robot: Robot) -> None:
     space = robot.workspace
-    scale = max(space.half_width / SEEN, space.height / SEEN_HEIGHT)
+    scale = max(space.half_width / USUAL, space.height / _SEEN_HEIGHT)
     middle, at = np.array([*space.centre, 0.0]), np.array([*space.centre, _LOOK_AT * scale])
     for name, way in _CAMERAS.items():
         pose = robot.cameras.get(name) or CameraPose(tuple(middle + scale * np.array(way)), tuple(at), _FIELD)

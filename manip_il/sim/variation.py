@@ -14,7 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import ManipError, MismatchError
+from manip_il.sim.config import CAMERAS
+from manip_il.sim.ranges import OWN, RANGES
 from manip_il.sim.shape import Shape, contact
 
 F64 = NDArray[np.float64]
@@ -24,31 +25,16 @@ GEOMS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
-_KINDS = {float(geom): kind for kind, geom in GEOMS.items()}
+KINDS = {int(geom): kind for kind, geom in GEOMS.items()}
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 PER_OBJECT = 5
 _SIZE, _MASS, _FRICTION = slice(0, 3), 3, 4
-_OWN = -1.0  # no shape or colour is drawn: objects keep their own
-_WORLD: dict[str, tuple[float, ...]] = {  # after the objects' numbers: values if nothing is drawn
-    "shape": (_OWN,),  # otherwise MuJoCo's geom type
-    "joint_damping": (1.0,),
-    "actuator_gain": (1.0,),
-    "posture": (0.0,),
-    "colour": (_OWN,) * 3,
-    "table": (_OWN,) * 3,
-    "brightness": (1.0,),
-    "light_turn": (0.0,),
-    **{f"{moved}.{camera}": (0.0,) * 3 for moved in ("camera_shift", "camera_turn") for camera in ("front", "wrist")},
-    # States recorded before the side camera end here.
-    "camera_shift.side": (0.0,) * 3,
-    "camera_turn.side": (0.0,) * 3,
-    "clutter": (0.0, 0.0),  # number of things, and the seed of their kinds and places
-}
-_STARTS = np.cumsum([0, *map(len, _WORLD.values())]).tolist()
-_PLACES = {name: slice(*ends) for name, *ends in zip(_WORLD, _STARTS[:-1], _STARTS[1:], strict=True)}
-NOTHING_DRAWN = np.concatenate(list(_WORLD.values()))  # the world's numbers, (w,)
-WORLD_SIZE = len(NOTHING_DRAWN)
-_NOT_PHYSICS = WORLD_SIZE - _PLACES["posture"].start  # numbers for how the episode began and how it looks
+_SHAPE = 0  # the place after the objects' numbers: `OWN`, or MuJoCo's geom type if a shape is drawn
+WORLD_SIZE = 1 + sum(len(quantity.places) for quantity in RANGES.values())
+NOTHING_DRAWN = np.full(WORLD_SIZE, OWN)  # the world's numbers, (w,)
+for _quantity in RANGES.values():
+    NOTHING_DRAWN[_quantity.places] = _quantity.nominal
+_NOT_PHYSICS = WORLD_SIZE - RANGES["posture"].places[0]  # numbers for how the episode began and how it looks
 
 
 @dataclass(frozen=True)
@@ -67,22 +53,30 @@ class Object:
 
 def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
     """Return the variation of a model as compiled, (v,)."""
-    parts = [
-        np.concatenate([model.geom_size[one.geom], [model.body_mass[one.body], model.geom_friction[one.geom, 0]]])
+    rows = [
+        [*model.geom_size[one.geom], model.body_mass[one.body], model.geom_friction[one.geom, 0]]
         for one in objects.values()
     ]
-    return np.concatenate([*parts, NOTHING_DRAWN])
+    return np.concatenate([*rows, NOTHING_DRAWN])
 
 
 def part(variation: F64, name: str) -> F64:
-    """Return the values of one quantity, such as `table` or `clutter`, in a variation (v,), as a NumPy view."""
-    return variation[len(variation) - WORLD_SIZE :][_PLACES[name]]
+    """Return the numbers of one quantity of `RANGES`, such as `table` or `clutter`, in a variation (v,)."""
+    return _world(variation)[RANGES[name].places]
 
 
-def check_size(variation: F64, like: F64) -> None:
-    """Raise `MismatchError` unless a variation (v,) is as long as the scene's own, `like` (v,)."""
-    if variation.shape != like.shape:
-        raise MismatchError("size of the variation", "the state", len(variation), "the scene", len(like))
+def seen_objects(variation: F64) -> tuple[F64, int | None]:
+    """Return `geom_size` of all objects, (o, 3) [m], and their MuJoCo geom type, None unless a shape was drawn."""
+    shape = float(_world(variation)[_SHAPE])
+    return _objects(variation)[:, _SIZE], None if shape == OWN else int(shape)
+
+
+def _world(variation: F64) -> F64:
+    return variation[len(variation) - WORLD_SIZE :]
+
+
+def _objects(variation: F64) -> F64:
+    return variation[: len(variation) - WORLD_SIZE].reshape(-1, PER_OBJECT)
 
 
 def same_physics(variation: F64, other: F64) -> bool:
@@ -97,7 +91,9 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
     a wooden one, unless a mass is drawn. camera_shift and camera_turn have a vector (3,) per camera.
     """
     varied = base.copy()
-    rows = varied[: len(base) - WORLD_SIZE].reshape(-1, PER_OBJECT)
+    rows, world = _objects(varied), _world(varied)
+    if "shape" in drawn:
+        world[_SHAPE] = GEOMS[drawn["shape"]]
     for row in rows:
         width = 2 * float(row[_SIZE].max())
         if "shape" in drawn:
@@ -107,23 +103,16 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
             row[_SIZE] *= drawn["size"] / width
     for name, column in (("mass", _MASS), ("friction", _FRICTION)):
         rows[:, column] = drawn.get(name, rows[:, column])
-    for name in _WORLD:
-        what, _, camera = name.partition(".")
-        if what in drawn:
-            value = drawn[what][camera] if camera else drawn[what]
-            part(varied, name)[:] = float(GEOMS[value]) if what == "shape" else value
+    for name, value in drawn.items():
+        if name in RANGES:
+            world[RANGES[name].places] = np.ravel(
+                [value[camera] for camera in CAMERAS] if isinstance(value, dict) else value
+            )
     return varied
 
 
-def seen_objects(variation: F64) -> tuple[F64, int | None]:
-    """Return `geom_size` of all objects, (o, 3) [m], and their MuJoCo geom type, None unless a shape was sampled."""
-    shape = float(part(variation, "shape")[0])
-    sizes = variation[: len(variation) - WORLD_SIZE].reshape(-1, PER_OBJECT)[:, _SIZE]
-    return sizes, None if shape == _OWN else int(shape)
-
-
 def apply(
-    model: mujoco.MjModel,
+    model: Any,
     plain: mujoco.MjModel,
     objects: Mapping[str, Object],
     motors: NDArray[np.int64],
@@ -134,61 +123,40 @@ def apply(
     plain: the model as compiled. motors: actuators of the arm's joints, (arm,). Call `mj_setConst` afterwards: it
     updates what depends on masses.
     """
-    _apply_dynamics(model, plain, motors, variation)
-    shape = float(part(variation, "shape")[0])
-    rows = variation[: len(variation) - WORLD_SIZE].reshape(-1, PER_OBJECT)
-    for one, row in zip(objects.values(), rows, strict=True):
-        _apply_object(model, plain, one, row, None if shape == _OWN else _KINDS[shape])
-
-
-def _apply_dynamics(changed: Any, plain: mujoco.MjModel, motors: NDArray[np.int64], variation: F64) -> None:
-    """Scale the arm's damping and gains, kv by the square root of kp's factor, which keeps the damping ratio."""
-    damping, gain = (float(part(variation, name)[0]) for name in ("joint_damping", "actuator_gain"))
+    # kv changes by the square root of kp's factor, which keeps the damping ratio.
+    damping, gain = part(variation, "joint_damping"), part(variation, "actuator_gain")
     dofs = plain.jnt_dofadr[plain.actuator_trnid[motors, 0]]
-    changed.dof_damping[dofs] = plain.dof_damping[dofs] * damping
-    changed.actuator_gainprm[motors, 0] = plain.actuator_gainprm[motors, 0] * gain  # kp
-    changed.actuator_biasprm[motors, 1] = plain.actuator_biasprm[motors, 1] * gain  # -kp
-    changed.actuator_biasprm[motors, 2] = plain.actuator_biasprm[motors, 2] * np.sqrt(gain)  # -kv
+    model.dof_damping[dofs] = plain.dof_damping[dofs] * damping
+    model.actuator_gainprm[motors, 0] = plain.actuator_gainprm[motors, 0] * gain  # kp
+    model.actuator_biasprm[motors, 1] = plain.actuator_biasprm[motors, 1] * gain  # -kp
+    model.actuator_biasprm[motors, 2] = plain.actuator_biasprm[motors, 2] * np.sqrt(gain)  # -kv
+    _, shape = seen_objects(variation)
+    for one, row in zip(objects.values(), _objects(variation), strict=True):
+        _apply_object(model, plain, one, row, shape)
 
 
-def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, shape: str | None) -> None:
-    geom, size, mass, friction = one.geom, row[_SIZE], float(row[_MASS]), float(row[_FRICTION])
+def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, shape: int | None) -> None:
+    geom, body = one.geom, one.body
+    size, mass, friction = row[_SIZE], float(row[_MASS]), float(row[_FRICTION])
     own = int(plain.geom_type[geom])
     kind, condim, rolling = own, int(plain.geom_condim[geom]), float(plain.geom_friction[geom, 2])
     if shape is not None:
-        kind, (condim, rolling) = int(GEOMS[shape]), contact(shape)
-    like, at, inertia = plain, geom, plain.body_inertia[one.body] * (mass / plain.body_mass[one.body])
-    if kind != _MESH and (kind != own or not np.array_equal(size, plain.geom_size[geom])):
+        kind, (condim, rolling) = shape, contact(KINDS[shape])
+    nodes = slice(plain.body_bvhadr[body], plain.body_bvhadr[body] + plain.body_bvhnum[body])
+    like, at, bounds = plain, geom, plain.bvh_aabb[nodes, 3:]
+    inertia = plain.body_inertia[body] * (mass / plain.body_mass[body])
+    if own != _MESH and (kind != own or not np.array_equal(size, plain.geom_size[geom])):
         like, at = _solid(kind, size, mass), 0
         inertia = like.body_inertia[1]
-    if kind != _MESH:
-        nodes = slice(plain.body_bvhadr[one.body], plain.body_bvhadr[one.body] + plain.body_bvhnum[one.body])
-        changed.geom_size[geom], changed.geom_rbound[geom] = size, like.geom_rbound[at]
-        others = plain.bvh_aabb[nodes, 3:] if plain.body_geomnum[one.body] > 1 else 0.0
-        changed.geom_aabb[geom, 3:] = like.geom_aabb[at, 3:]
-        changed.bvh_aabb[nodes, 3:] = np.maximum(like.geom_aabb[at, 3:], others)
-    changed.geom_type[geom], changed.geom_condim[geom] = kind, condim
-    changed.body_mass[one.body], changed.body_inertia[one.body] = mass, inertia
+        bounds = np.maximum(like.geom_aabb[0, 3:], bounds if plain.body_geomnum[body] > 1 else 0.0)
+    for name in ("geom_type", "geom_size", "geom_rbound", "geom_aabb"):
+        getattr(changed, name)[geom] = getattr(like, name)[at]
+    changed.bvh_aabb[nodes, 3:] = bounds
+    changed.geom_condim[geom] = condim
+    changed.body_mass[body], changed.body_inertia[body] = mass, inertia
     # MuJoCo uses the larger friction of two touching geoms unless one has priority; a drawn friction gets it.
-    drawn = friction != plain.geom_friction[geom, 0]
     changed.geom_friction[geom, 0], changed.geom_friction[geom, 2] = friction, rolling
-    changed.geom_priority[geom] = 1 if drawn else plain.geom_priority[geom]
-
-
-def extents(kind: int, size: F64) -> F64:
-    """Return a geom's lengths along its axes [m], (3,), from `geom_size`; a mesh counts as a box about its origin."""
-    geom = mujoco.mjtGeom
-    if kind in (int(geom.mjGEOM_BOX), _MESH):
-        return 2 * size
-    if kind == int(geom.mjGEOM_SPHERE):
-        return np.full(3, 2 * size[0])
-    if kind == int(geom.mjGEOM_CYLINDER):
-        return 2 * np.array([size[0], size[0], size[1]])
-    if kind == int(geom.mjGEOM_CAPSULE):
-        return 2 * np.array([size[0], size[0], size[1] + size[0]])
-    raise ManipError(
-        f"the first geom of an object is of MuJoCo's type {kind}; expected a box, cylinder, sphere, capsule or mesh"
-    )
+    changed.geom_priority[geom] = plain.geom_priority[geom] or friction != plain.geom_friction[geom, 0]
 
 
 def _solid(kind: int, size: F64, mass: float) -> mujoco.MjModel:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from functools import lru_cache
+from operator import attrgetter
 from typing import Any
 
 import mujoco
@@ -16,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.scene import SEEN, TABLE, camera_id
+from manip_il.sim.scene import TABLE, camera_id
 from manip_il.sim.variation import part, seen_objects
-from manip_il.sim.world import Scene, once_per_scene
+from manip_il.sim.world import SCENES_KEPT, Scene
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.integer]
@@ -27,7 +29,7 @@ _LEAST_CELL = 0.008  # least width of a cell: a pixel at 128 x 128; less if the 
 _PLAIN_FACES = 1_600  # meshes with up to this many faces are not simplified
 _PULL = 0.01  # weight of a cell's mean, relative to its faces' planes, in placing its vertex
 _LEAST_PULL = 1e-12  # [m^2] if a cell has no faces
-_LAMPS = ("light_ambient", "light_diffuse", "light_specular")
+_LAMPS = tuple(lamp + colour for lamp in ("light_", "vis.headlight.") for colour in ("ambient", "diffuse", "specular"))
 _CHANGED = (
     "geom_type",
     "geom_size",
@@ -55,8 +57,7 @@ class ViewModel:
         self._objects = [one.geom for one in scene.objects.values()]
         self._table = [self.model.geom(TABLE).id]
         self._light(look.brightness, look.light_turn)
-        self._plain = {name: getattr(self.model, name).copy() for name in _CHANGED}
-        self._headlight = [colour.copy() for colour in self._headlight_colours()]
+        self._plain = {name: attrgetter(name)(self.model).copy() for name in _CHANGED}
         self._applied = scene.nominal
 
     def apply(self, variation: F64) -> None:
@@ -64,23 +65,18 @@ class ViewModel:
         if np.array_equal(variation, self._applied):
             return
         for name, plain in self._plain.items():
-            getattr(self.model, name)[:] = plain
-        for colour, plain in zip(self._headlight_colours(), self._headlight, strict=True):
-            colour[:] = plain
+            attrgetter(name)(self.model)[:] = plain
         sizes, kind = seen_objects(variation)
         self.model.geom_size[self._objects] = sizes
         if kind is not None:
             self.model.geom_type[self._objects] = kind
         self._paint(self._objects, part(variation, "colour"))
         self._paint(self._table, part(variation, "table"))
-        for name in CAMERAS:
-            self._move_camera(name, part(variation, f"camera_shift.{name}"), part(variation, f"camera_turn.{name}"))
+        shifts, turns = (part(variation, name).reshape(-1, 3) for name in ("camera_shift", "camera_turn"))
+        for moved in zip(CAMERAS, shifts, turns, strict=True):
+            self._move_camera(*moved)
         self._light(float(part(variation, "brightness")[0]), float(part(variation, "light_turn")[0]))
         self._applied = variation.copy()
-
-    def _headlight_colours(self) -> list[Any]:
-        lamp = self.model.vis.headlight
-        return [lamp.ambient, lamp.diffuse, lamp.specular]
 
     def _paint(self, geoms: Sequence[int], colour: F64) -> None:
         if (colour >= 0).all():
@@ -90,17 +86,15 @@ class ViewModel:
     def _move_camera(self, name: str, shift: F64, turn: F64) -> None:
         """Move a camera [m], and turn it [deg], in its own frame."""
         camera = camera_id(self.model, name)
-        quat, turned, moved = self.model.cam_quat[camera].copy(), np.empty(4), np.empty(3)
+        quat, moved = self.model.cam_quat[camera], np.empty(3)
         mujoco.mju_rotVecQuat(moved, shift, quat)
         self.model.cam_pos[camera] += moved
-        if angle := float(np.linalg.norm(np.deg2rad(turn))):
-            mujoco.mju_axisAngle2Quat(turned, np.deg2rad(turn) / angle, angle)
-            mujoco.mju_mulQuat(self.model.cam_quat[camera], quat, turned)
+        mujoco.mju_quatIntegrate(quat, np.deg2rad(turn), 1.0)
 
     def _light(self, brightness: float, light_turn: float) -> None:
         """Multiply every lamp by a factor, and turn those fixed in the world about the vertical [deg]."""
-        for colour in (*self._headlight_colours(), *(getattr(self.model, name) for name in _LAMPS)):
-            colour[:] *= brightness
+        for name in _LAMPS:
+            attrgetter(name)(self.model)[:] *= brightness
         turn = np.deg2rad(light_turn)
         rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
         in_world = self.model.light_bodyid == 0
@@ -108,10 +102,10 @@ class ViewModel:
             vectors[in_world] = vectors[in_world] @ rotation.T
 
 
-@once_per_scene
+@lru_cache(SCENES_KEPT)
 def _with_few_faces(scene: Scene) -> mujoco.MjModel:
     model = copy.copy(scene.model)
-    simplify_meshes(model, min(1.0, scene.robot.workspace.half_width / SEEN) * _LEAST_CELL)
+    simplify_meshes(model, scene.scale * _LEAST_CELL)
     return model
 
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property, wraps
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, NoReturn
 
 import mujoco
@@ -32,6 +32,8 @@ STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _BESIDE, _NEAR = (-0.02, 0.07), 0.08  # heights and distance at which a hand may hit a neighbour of an object [m]
 _MOST_TURNS = 4  # symmetric turns tried in each direction
 _AT_REST = 0.03, 0.5  # speeds below which an object is at rest [m/s], [rad/s]
+SCENES_KEPT = 4  # scenes cached per process, and what is computed from one: the finest meshes take 64 MB
+USUAL = 0.15  # half width of Panda's workspace [m]
 GOAL = "goal"  # the mocap body that marks the goal
 
 
@@ -65,7 +67,6 @@ class Scene:
     yaws: tuple[float, float]
     nominal: F64
     hulls: Mapping[str, Hull]
-    kept: dict[Any, Any] = field(default_factory=dict[Any, Any], init=False)  # results of `once_per_scene`
 
     @cached_property
     def state_size(self) -> int:
@@ -78,22 +79,20 @@ class Scene:
         shape = getattr(self.task, "shape", None)
         return shape is not None and shape.kind == ANY
 
+    @cached_property
+    def scale(self) -> float:
+        """Width of the workspace as a share of Panda's, at most 1."""
+        return min(1.0, self.robot.workspace.half_width / USUAL)
+
+    @cached_property
+    def furniture(self) -> NDArray[np.int64]:
+        """The geoms of mocap bodies: goal markers and the fixed parts of the task."""
+        return np.flatnonzero(self.model.body_mocapid[self.model.body_rootid[self.model.geom_bodyid]] >= 0)
+
     @property
     def name(self) -> str:
         """Robot and task, for messages."""
         return f"{self.robot.name} {self.task.name}"
-
-
-def once_per_scene[T](compute: Callable[[Scene], T]) -> Callable[[Scene], T]:
-    """Return `compute` as a function whose result is kept as long as the scene exists."""
-
-    @wraps(compute)
-    def kept(scene: Scene) -> T:
-        if compute not in scene.kept:
-            scene.kept[compute] = compute(scene)
-        return scene.kept[compute]
-
-    return kept
 
 
 class World:
@@ -116,7 +115,6 @@ class World:
         self.model, self.data = model, data
         at, self._poses = self.scene.ee_site, dict[str, Pose]()
         self.ee = Pose(data.site_xpos[at], data.site_xmat[at].reshape(3, 3))  # a view that follows the world
-        self._shapes: dict[str, tuple[int, tuple[float, ...]]] = {}
 
     def __reduce__(self) -> NoReturn:
         raise ManipError("an environment cannot be copied or pickled; make a new one and restore get_state() there")
@@ -125,7 +123,8 @@ class World:
 
     def vary(self, variation: F64) -> None:
         """Apply the physics of `variation` (v,) to the model. Raises `MismatchError` for one of another length."""
-        variations.check_size(variation, self.scene.nominal)
+        if len(variation) != (size := len(self.scene.nominal)):
+            raise MismatchError("size of the variation", "the state", len(variation), "the scene", size)
         if variation.tobytes() == self.variation.tobytes():
             return
         self._cache.clear()
@@ -238,22 +237,18 @@ class World:
 
     def extents(self, name: str) -> tuple[float, ...]:
         """Return an object's lengths along its own x, y and z [m]; for a mesh, those of a box centred on its origin."""
-        return self._shape(name)[1]
+        hull, geom = self.hull(name), self.scene.objects[name].geom
+        if hull is not None:
+            return hull.extents
+        return self.remember(("extents", name), lambda: tuple((2 * self.model.geom_aabb[geom, 3:]).tolist()))
 
     def kind(self, name: str) -> int:
         """Return MuJoCo's geom type of an object."""
-        return self._shape(name)[0]
+        return int(self.model.geom_type[self.scene.objects[name].geom])
 
     def hull(self, name: str) -> Hull | None:
         """Return the hull of an object that is a mesh; None for any other."""
         return self.scene.hulls.get(name)
-
-    def _shape(self, name: str) -> tuple[int, tuple[float, ...]]:
-        if name not in self._shapes:
-            geom = self.scene.objects[name].geom
-            kind, size, hull = int(self.model.geom_type[geom]), self.model.geom_size[geom], self.hull(name)
-            self._shapes[name] = kind, hull.extents if hull else tuple(variations.extents(kind, size).tolist())
-        return self._shapes[name]
 
     def at_rest(self, name: str) -> bool:
         """Return whether an object is at rest: slower than 3 cm and half a radian per second."""
@@ -283,12 +278,8 @@ class World:
     @cached_property
     def _standing(self) -> Mapping[str, NDArray[np.int64]]:
         """For each object, the geoms of furniture and of the other objects."""
-        model, objects = self.scene.model, self.scene.objects
-        furniture = [
-            geom
-            for geom, root in enumerate(model.body_rootid[model.geom_bodyid])
-            if model.body_mocapid[root] >= 0 and model.geom_contype[geom]
-        ]
+        objects, furniture = self.scene.objects, self.scene.furniture
+        furniture = furniture[self.scene.model.geom_contype[furniture] > 0]
         return {
             name: np.array([*furniture, *(one.geom for other, one in objects.items() if other != name)], dtype=np.int64)
             for name in objects

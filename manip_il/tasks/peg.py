@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from manip_il.mdp import F64
 from manip_il.robots.reach import ARRIVES, reach_of
 from manip_il.robots.rotations import angle_across, angle_between, rotation_matrix, rotation_vector
 from manip_il.sim.task import Rung, Target
-from manip_il.sim.world import Scene, World, once_per_scene
+from manip_il.sim.world import SCENES_KEPT, Scene, World
 from manip_il.tasks.grasp import OPEN_SLACK, lie_of, once_per_state
 from manip_il.tasks.ladder import CLOSED, nearness, rise_first
 
@@ -144,7 +145,7 @@ def grip_of(world: World) -> Grip:
     return Grip(position, rotation, off, angle, height, world.opening >= width + slack)
 
 
-@once_per_scene
+@lru_cache(SCENES_KEPT)
 def _farthest(scene: Scene) -> float:
     """Farthest x at which the hand reaches the table [m]."""
     x, y = scene.robot.workspace.centre

@@ -36,7 +36,6 @@ def test_a_target_reaches_the_robot_as_the_joints_it_means():
         seen = env.observe()
         assert np.array_equal(observed[1, :-2], np.concatenate([seen.state, seen.environment_state]))
         action = HAND.decode(up(0.02)[None], seen.state[None])[0].astype(np.float64)
-        env.begin_step()
         env.advance(action)
         ours.step_async(np.stack([up(-0.01), up(0.02)]))
         observed = np.asarray(ours.step_wait()[0])

@@ -42,15 +42,13 @@ class Counter:
     def start(self, seed: int) -> None:
         self.x, self.steps = 0.0, 0
 
-    def begin_step(self) -> None:
-        self.x -= 5.0 * (self.steps == self.kick)
-
     def advance(self, action: np.ndarray) -> np.ndarray:
         self.x += float(action[0]) + self.noise
         self.steps += 1
         return action + self.noise if self.noise else action
 
     def observe(self) -> Observation:
+        self.x -= 5.0 * (self.steps == self.kick)
         return Observation(np.array([self.x], np.float32), np.array([self.steps], np.float32))
 
     def get_state(self) -> State:

@@ -64,7 +64,6 @@ def test_costs_are_those_of_stepping_the_simulator_by_hand(measured: Certificate
         env = make_env("fetch", "pick_place", conditions=[perturbation])
         env.start(seed)
         for step in range(moment + env.config.horizon):
-            env.begin_step()
             env.advance(expert.label(env.get_state()).action)
             if env.solved:
                 return step + 1 - moment

@@ -130,7 +130,7 @@ def test_the_sliders_of_a_window_move_the_leader_and_follow_a_new_world(
     start = station.env.data.qpos[station.follower.q]
     move = session.slider_mover(station)
     first = move()
-    station.env.count_step()
+    station.env.simulate()
     assert np.allclose([first, move()], [start, start + 0.1])
     station.reset(2)
     assert np.allclose(np.array(move()), station.env.data.qpos[station.follower.q])

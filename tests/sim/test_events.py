@@ -8,14 +8,13 @@ import pytest
 
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.events import KINDS, STANDARD, Events, move_object
+from manip_il.sim.events import KINDS, Events, move_object
 from manip_il.tasks.objects import CUBE_HALF
 
 from ..scenes import SEED, bits, cube, drive_until, started, still
 from ..tables import WITH_A_CUBE
 
 MOMENT = 7
-KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), action_noise=(0.1, 0.1))
 
 
 @pytest.fixture(params=WITH_A_CUBE, ids="-".join)
@@ -62,30 +61,6 @@ def test_a_share_of_the_actions_is_random_and_the_others_are_as_they_were(env: M
     actions = env.scene.actions
     beyond = np.abs(np.array(executed[0]) - env.observe().state)[:, actions.arm] - actions.scale[actions.arm]
     assert beyond.max() < 1e-6
-
-
-def run(env: ManipEnv, condition: Condition, seed: int) -> tuple[bytes, dict[int, float]]:
-    """What 26 steps of zeros do, and the knocks on the way: step -> distance [m]."""
-    env.start(SEED)
-    happening, knocks, done = Events(env.world, condition.draw(seed), seed), {}, b""
-    for step in range(26):
-        before = cube(env)
-        assert not happening.before(step)  # no perturbation
-        if not np.array_equal(before, cube(env)):
-            knocks[step] = float(np.linalg.norm(cube(env) - before))
-        done += happening.action(np.zeros(len(env.scene.actions)), step).tobytes() + cube(env).tobytes()
-    return done, knocks
-
-
-@pytest.mark.parametrize("condition", [STANDARD, KNOCKED], ids=str)
-def test_knocks_and_noise_are_a_function_of_the_seed(env: ManipEnv, condition: Condition):
-    first, second = run(env, condition, 1), run(env, condition, 2)
-    assert first == run(env, condition, 1)
-    assert first[0] != second[0]
-    for _, knocks in (first, second):
-        [(step, distance)] = knocks.items()
-        assert 5 <= step < 25
-        assert 0.05 <= distance <= 0.08
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -7,9 +7,7 @@ import pytest
 
 from manip_il.robots.spec import model_bytes
 from manip_il.robots.table import get_robot
-from manip_il.sim.config import DT_SIM
 from manip_il.sim.scene import build_scene
-from manip_il.sim.variation import PER_OBJECT, WORLD_SIZE
 from manip_il.tasks.envs import scene_of
 from manip_il.tasks.objects import CUBE_HALF
 from manip_il.tasks.table import TASKS
@@ -50,18 +48,3 @@ def test_a_scene_is_compiled_once_and_is_the_same_bytes_again(robot: str, task: 
     scene = scene_of(robot, task)
     assert scene_of(robot, task) is scene
     assert model_bytes(build_scene.__wrapped__(get_robot(robot), TASKS[task]).model) == model_bytes(scene.model)
-
-
-@every_scene
-def test_addresses_are_what_their_names_say(robot: str, task: str):
-    scene = scene_of(robot, task)
-    assert scene.model.opt.timestep == DT_SIM
-    for address, motor, name in zip(scene.arm_q, scene.arm_ctrl, scene.robot.joints, strict=True):
-        joint = scene.model.joint(f"robot/{name}")
-        assert joint.qposadr[0] == address
-        assert scene.model.actuator_trnid[motor, 0] == joint.id
-    for name, one in scene.objects.items():
-        assert scene.model.joint(name).qposadr[0] == one.q
-        assert scene.model.joint(name).dofadr[0] == one.v
-        assert scene.model.geom(one.geom).bodyid[0] == one.body == scene.model.body(name).id
-    assert len(scene.nominal) == PER_OBJECT * len(scene.objects) + WORLD_SIZE

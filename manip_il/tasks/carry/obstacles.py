@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import mujoco
@@ -11,7 +12,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.geometry import outline
-from manip_il.sim.world import Scene, World, once_per_scene
+from manip_il.sim.world import SCENES_KEPT, Scene, World
 from manip_il.tasks.carry.layout import DEFAULT, FEATURES, FULL, OBSTACLES, TASTES, Edge, Layout, Part, Reward
 from manip_il.tasks.grasp import once_per_state
 from manip_il.tasks.objects import add_furniture, add_part
@@ -160,7 +161,7 @@ class HandShape(NamedTuple):
     home: F64
 
 
-@once_per_scene
+@lru_cache(SCENES_KEPT)
 def hand_of(scene: Scene) -> HandShape:
     """Return the shape of the hand of a scene's robot, in its home pose; cached."""
     model, data = scene.model, mujoco.MjData(scene.model)

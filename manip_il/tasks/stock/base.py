@@ -56,9 +56,6 @@ class StockBase:
         self._ever = self._ever or solved
         return action
 
-    def begin_step(self) -> None:
-        """Do nothing: stock environments have no disturbances."""
-
     @property
     def solved(self) -> bool:
         """Whether the task is solved after the last step."""
