@@ -13,7 +13,7 @@ from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import Output, OutputFile, Replacing, publish
 from manip_il.cli.progress import progress, say, say_next
 from manip_il.data.atomic import write_file, write_json
-from manip_il.errors import ManipError, RenderError
+from manip_il.errors import ManipError
 from manip_il.option import NameOrPath, Seeded, option
 from manip_il.tasks import NAMES
 from manip_il.tasks.config import EnvConfig
@@ -60,7 +60,7 @@ class RobotNewOptions(Replacing):
 class RobotCheckOptions:
     """Measure what an arm can do, before recording; writes check.html and check.json.
 
-    Shows the arm with its hand frame and cameras, its reach, the expert's success at every task (also with a tenth of
+    Shows the arm's reach, the expert's success at every task (also with a tenth of
     its actions random), and what to change if something does not work. The exit code is 1 if a task cannot be done.
     """
 
@@ -92,12 +92,7 @@ class RobotCheckOptions:
             with progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar, Engine(None) as engine:
                 found = robot_check.check_robot(self.robot, tasks, self.episodes, engine, lambda _: bar.step())
             write_json(folder / robot_check.FILE_NAME, found.to_json())
-            try:
-                pictures, no_pictures = robot_check.looks(self.robot), ""
-            except RenderError as error:
-                pictures, no_pictures = (), str(error)
-            page = robot_check.check_report(found, pictures, no_pictures, command_line(), to_plain(self))
-            page.write(folder / PAGE)
+            robot_check.check_report(found, command_line(), to_plain(self)).write(folder / PAGE)
         print_table(robot_check.task_table(found))
         say(robot_check.verdict(found), *(f"change: {line}" for line in robot_check.advice(found)))
         say(f"page: {folder / PAGE}")

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.errors import UsageError
 from manip_il.evaluation.figures import INK, Figure, drawing, to_figure
-from manip_il.evaluation.film import encode_jpeg
-from manip_il.evaluation.report import Film, Report, Section
+from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
@@ -26,10 +23,7 @@ from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
-from manip_il.sim.config import FILM
-from manip_il.sim.render import framed_picture
-from manip_il.sim.scene import PREFIX
-from manip_il.sim.world import Scene, World
+from manip_il.sim.world import World
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import get_task
@@ -144,22 +138,15 @@ def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
     return [[reach.has((x + dx, y + dy, LOW)) for dx in steps] for dy in steps]
 
 
-def check_report(
-    check: RobotCheck, pictures: Sequence[Film], no_pictures: str, command: str, config: Mapping[str, Any]
-) -> Report:
-    """Return the HTML report of a check. no_pictures: why there are no pictures, or empty."""
-    lead = () if pictures else (f"No pictures: {no_pictures}",)
+def check_report(check: RobotCheck, command: str, config: Mapping[str, Any]) -> Report:
+    """Return the HTML report of a check."""
     tasks = (
         f"Starts: how many of {STARTS} were drawn before one found no place within reach. Random actions: a tenth of "
-        "the actions, the gripper's included. Intervals are Wilson's score intervals."
-    )
-    home = (
-        "Axes of ee: x red, y (along the fingers' motion) green, z (out of the hand) blue. "
-        f"The gripper opens to {1000 * check.opening:.1f} mm."
+        "the actions, the gripper's included."
     )
     reach = (
-        f"Pointing down, the hand reaches {100 * check.table:.0f} % of the workspace on the table (the frame). Points "
-        "that it reaches are green."
+        f"The gripper opens to {1000 * check.opening:.1f} mm. Pointing down, the hand reaches "
+        f"{100 * check.table:.0f} % of the workspace on the table (the frame). Points that it reaches are green."
     )
     return Report(
         title=f"{check.robot.name}: robot check",
@@ -169,7 +156,6 @@ def check_report(
         config=config,
         sections=(
             Section("Tasks", tables=(task_table(check),), notes=(tasks,)),
-            Section("At home in its scene", lead, films=tuple(pictures), notes=(home,)),
             Section("Where it reaches", figures=(_reach_figure(check.robot),), notes=(reach,)),
         ),
     )
@@ -180,7 +166,7 @@ def verdict(check: RobotCheck) -> str:
     count, cannot = len(check.tasks), ", ".join(task.name for task in check.failed)
     asked = any(task.clean is not None for task in check.tasks)
     can, end = ("can do", "") if asked else ("has starts for", "; the expert was not run")
-    words = f"{check.robot.name} {can} {count - len(check.failed)} of {count} task{'s' if count > 1 else ''}{end}"
+    words = f"{check.robot.name} {can} {count - len(check.failed)} of {count} tasks{end}"
     return f"{words}; it cannot do {cannot}." if cannot else f"{words}."
 
 
@@ -210,7 +196,7 @@ def _reach_figure(robot: Robot) -> Figure:
 
 def advice(check: RobotCheck) -> tuple[str, ...]:
     """Return what to change in the robot's YAML: first for the arm, then for each task that it cannot do."""
-    lines, space = _overlaps(scene_of(check.name, "reach")), check.robot.workspace
+    lines, space = list[str](), check.robot.workspace
     if check.table < ENOUGH:
         x, y = space.centre
         lines.append(
@@ -227,49 +213,3 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
             watch = f"manip-il view --robot.type={check.name} --task.type={task.name}"
             lines.append(f"{task.name}: {failed}, {count} in phase {phase}; watch it: {watch}")
     return tuple(lines)
-
-
-def _overlaps(scene: Scene) -> list[str]:
-    """Name the bodies that overlap at home, with their depth [mm], in a line; no line if there are none."""
-    depths = dict[str, float]()
-    for contact in _at_home(scene).contact:
-        bodies = sorted(scene.model.geom_bodyid[contact.geom])
-        pair = " and ".join(scene.model.body(body).name.removeprefix(PREFIX) for body in bodies)
-        depths[pair] = max(depths.get(pair, 0.0), -1000 * contact.dist)
-    pairs = ", ".join(f"{pair} by {depth:.1f} mm" for pair, depth in depths.items())
-    remedy = "set another home or base, or exclude their contacts in the model (<exclude body1= body2=/>)."
-    return [f"At home parts overlap: {pairs}: {remedy}"] if pairs else []
-
-
-def _at_home(scene: Scene) -> mujoco.MjData:
-    """The physics of a scene with the arm at home and the gripper open."""
-    data, gripper = mujoco.MjData(scene.model), scene.gripper
-    data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = scene.robot.home
-    gripper.put(data, gripper.most)
-    mujoco.mj_forward(scene.model, data)
-    return data
-
-
-def looks(name: NameOrPath) -> tuple[Film, ...]:
-    """Return pictures of a robot in its home pose, with the axes of its frame `ee`.
-
-    Raises `RenderError` without off-screen OpenGL.
-    """
-    scene = scene_of(name, "reach")
-    data = _at_home(scene)
-    (x, y), half = scene.robot.workspace.centre, scene.robot.workspace.half_width
-    corners = [np.array([x + a * half, y + b * half, 0.001]) for a, b in _SQUARE]
-    points = np.vstack([data.xpos[1:], corners])
-    low, high = points.min(axis=0), points.max(axis=0)
-    outside = mujoco.MjvCamera()
-    outside.lookat[:], outside.azimuth, outside.elevation = (low + high) / 2, 55.0, -20.0
-    outside.distance = 0.6 * float(np.linalg.norm(high - low)) / math.sin(math.radians(22.5))
-    views: tuple[tuple[str | mujoco.MjvCamera, str], ...] = (
-        (outside, "from outside"),
-        ("front", "what camera front sees"),
-        ("wrist", "what camera wrist sees"),
-    )
-    data.mocap_pos[:, 2] = -9.0  # move goals out of sight
-    return tuple(
-        Film(words, poster=encode_jpeg(framed_picture(scene, data, view, (480, 640), FILM))) for view, words in views
-    )
