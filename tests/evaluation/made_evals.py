@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from manip_il.evaluation.arm import Arm, Member
 from manip_il.evaluation.comparison import Study
-from manip_il.evaluation.film import encode_jpeg, encode_mp4
+from manip_il.evaluation.film import encode_mp4
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
-from manip_il.evaluation.rounds import History, Rule, history
+from manip_il.evaluation.rounds import Rule, history
+from manip_il.evaluation.side import Member, Side
 
 from .test_rounds import records
 
@@ -51,11 +51,19 @@ def made_eval(
 
 def made_pair(left: Fails, right: Fails, seeds: int = 1) -> Study:
     """Two runs; with several training seeds each seed's policy fails in the same episodes."""
-    arms = (
-        _arm("runs/cloning", left, seeds, (0.3, 0.5, 0.6)),
-        _arm("runs/dagger", right, seeds, (0.5, 0.9)),
+    sides = (
+        made_side("runs/cloning", [made_eval(fails=left)] * seeds, (0.3, 0.5, 0.6)),
+        made_side("runs/dagger", [made_eval(fails=right)] * seeds, (0.5, 0.9)),
     )
-    return Study(arms, "runs/cloning")
+    return Study(sides, "runs/cloning")
+
+
+def made_side(name: str, results: Sequence[EvalResult], successes: tuple[float, ...], labels: int = 100) -> Side:
+    """A side of runs, one per result, whose rounds had these successes on validation."""
+    run = history(records(successes, labels), name)
+    chosen = Rule().select(run, name)
+    members = (Member(Path(name) / f"seed_{i}", i, run, Path("p"), chosen, one) for i, one in enumerate(results))
+    return Side(name, tuple(members))
 
 
 def small_film(number: int) -> Film:
@@ -63,17 +71,7 @@ def small_film(number: int) -> Film:
     frames = np.full((12, 48, 64, 3), 230, dtype=np.uint8)
     for index, frame in enumerate(frames):
         frame[10:30, 4 * index : 4 * index + 14] = (200, 40 * number % 255, 60)
-    poster = encode_jpeg(frames[-1])
-    return Film("policy", encode_mp4(list(frames), 12), f"seed {FIRST_SEED + number}", poster)
-
-
-def _arm(name: str, fails: Fails, seeds: int, successes: tuple[float, ...]) -> Arm:
-    run = history(records(successes), name)
-    return Arm(name, tuple(_member(name, seed, made_eval(name, fails=fails), run) for seed in range(seeds)))
-
-
-def _member(name: str, seed: int, result: EvalResult, run: History) -> Member:
-    return Member(Path(name) / f"seed_{seed}", seed, run, Path("p"), Rule().select(run, name), result)
+    return Film("policy", encode_mp4(list(frames), 12), f"seed {FIRST_SEED + number}")
 
 
 def _detail(rng: np.random.Generator, condition: str) -> dict[str, Any]:

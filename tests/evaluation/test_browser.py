@@ -22,12 +22,12 @@ PAIR = made_pair(far_corner, lambda number, _: number % 37 == 0, seeds=2)
 
 
 def made_report() -> Report:
-    """With conditions, a map, films and settings."""
+    """With conditions, films and settings."""
     films = [small_film(number) for number in range(3)]
     return eval_report(RESULT, "manip-il eval --policy.path=runs/a", {"a": {"b": 1}}, films)
 
 
-REPORTS = {"eval": made_report, "compare": lambda: compare_report(PAIR, "a against b", "manip-il compare a b")}
+REPORTS = {"eval": made_report, "compare": lambda: compare_report(PAIR, "a against b", "manip-il compare a b", {})}
 
 
 @pytest.fixture(scope="module")
