@@ -21,7 +21,7 @@ from manip_il.evaluation.intervals import (
     sign_flip_exact,
 )
 from manip_il.evaluation.results import require_comparable
-from manip_il.evaluation.rounds import Cost, Round, Rule, costs_of, format_amount
+from manip_il.evaluation.rounds import Cost, Round, Rule, costs_of
 from manip_il.evaluation.side import Side
 from manip_il.evaluation.tables import Table
 
@@ -171,12 +171,14 @@ class Study:
         """Return the sentences after the verdict: comparisons with the baseline, and how rounds were chosen."""
         verdicts = [comparison.verdict for comparison in self.comparisons.values()]
         facts = verdicts if len(verdicts) > 1 else []
+        if self.comparisons and len(self.sides[0].members) > 1:
+            facts.append("Intervals are Student's over training seeds; p is exact and holds for these policies alone.")
         if any(member.chosen for side in self.sides for member in side.members):
             facts.append(self.rule.fact)
         return facts
 
     def table(self) -> Table:
-        """Return one row per side: mean costs, validation, test success, difference, and the cost to the target.
+        """Return one row per side: mean costs, validation, test success, difference, cost to the target on validation.
 
         Brackets hold the values of each training seed or, for a single seed, the interval.
         """
@@ -188,13 +190,12 @@ class Study:
             cells.append(_rates([one.validation for one in chosen]) if chosen else "")
             cells.append(_rates([result.success for result in side.results]))
             points = against and f"{format_points(against.difference, against.interval)}, {format_p(against.p_value)}"
-            first = self._reached(side)
-            missed = f"not reached in {first.count(None)} of {len(first)} seeds" if side.histories else ""
-            reached = missed if None in first else _mean_cost(costs[0], first)
+            reached = "not reached" if side.histories else ""
+            if None not in (first := self._reached(side)):
+                reached = _mean_cost(costs[0], first)
             rows.append((side.name, *cells, points or "", reached))
         head = ("side", *costs, "validation", "test", f"test, against {self.baseline}")
-        target = f"{costs[0]} to {100 * self.target:g} % of validation"
-        return Table((*head, target), tuple(rows))
+        return Table((*head, f"{costs[0]} to {100 * self.target:g} %"), tuple(rows))
 
     def _reached(self, side: Side) -> list[Round | None]:
         """Return, for each training seed, the round in which validation first reached the target."""
@@ -233,7 +234,7 @@ class Study:
 
 def _mean_cost(cost: Cost, rounds: Sequence[Round | None]) -> str:
     """Return the mean amount without its unit, which is in the column's header."""
-    return format_amount(cost, fmean(one.amount(cost) for one in rounds if one)).removesuffix(f" {cost}")
+    return f"{fmean(one.amount(cost) for one in rounds if one):,.0f}"
 
 
 def _rates(found: Sequence[Proportion]) -> str:

@@ -54,8 +54,8 @@ def run_report(
 
     runs: whose rounds are drawn as curves. parts: other fields of `Report`, such as the title.
     """
-    tested = [side.disturbed for side in sides if side.disturbed] or [sides[0].results[0]]
-    results = _results(sides, success_table(sides), "", tested[0])
+    tested = next((side.disturbed for side in sides if side.disturbed), sides[0].results[0])
+    results = _results(sides, success_table(sides), "", tested)
     return Report(sections=(results, *_curves(runs), *_films(films, no_films)), **parts)
 
 
@@ -122,7 +122,7 @@ def evaluation_verdict(result: EvalResult) -> str:
     phase, count = next(iter(result.failures.items()), ("", 0))
     if not phase:  # nothing failed, or the task has no phases
         return f"{verdict}."
-    return f"{verdict}; {count:,} of its {success.n - success.successes:,} failures end in the phase {_spaced(phase)}."
+    return f"{verdict}; {count:,} of its {success.n - success.successes:,} failures end in the phase {phase}."
 
 
 def _results(sides: Sequence[Side], table: Table, note: str, tested: EvalResult) -> Section:
@@ -137,7 +137,7 @@ def _failures(sides: Sequence[Side]) -> list[Section]:
     """Return a section with the failed episodes of each side by the phase that they ended in; [] if none failed."""
     counted = [sum((Counter(result.failures) for result in side.results), Counter[str]()) for side in sides]
     total = sum(counted, Counter[str]()).most_common()
-    rows = [(_spaced(phase), *(f"{counts[phase]:,}" for counts in counted)) for phase, _ in total if phase]
+    rows = [(phase, *(f"{counts[phase]:,}" for counts in counted)) for phase, _ in total if phase]
     columns = ("phase that it ended in", *(side.name for side in sides))
     return [Section("Where they fail", tables=(Table(columns, tuple(rows)),))] if rows else []
 
@@ -155,7 +155,3 @@ def _films(films: Sequence[Film], no_films: str) -> list[Section]:
     if not films and not no_films:
         return []
     return [Section("How it looks", (f"No films: {no_films}",) if no_films else (), films=tuple(films))]
-
-
-def _spaced(phase: str) -> str:
-    return phase.replace("_", " ")

@@ -27,12 +27,9 @@ _DPI = 96
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",  # looks the same whatever fonts a machine has
     "svg.hashsalt": "manip_il",  # so that equal figures have equal bytes
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib
     "font.size": 8.5,
     "axes.grid": True,
     "grid.color": RULE,
-    "axes.axisbelow": True,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "legend.frameon": False,
@@ -45,7 +42,7 @@ class Figure:
 
     svg: bytes
     words: str
-    width: int = 0
+    width: int
 
 
 @contextmanager
@@ -82,8 +79,8 @@ def rates_figure(sides: Sequence[Side]) -> Figure:
         axis = axes[0, 0]
         for place, side in enumerate(sides):
             for number, result in enumerate(side.results):
-                ends, at = result.success.interval, place + 0.1 * number
-                axis.plot([100 * end for end in ends], [at, at], color=side.colour, lw=3, alpha=0.4)
+                at = place + 0.5 * number / len(side.results)
+                axis.plot([100 * end for end in result.success.interval], [at, at], color=side.colour, lw=3, alpha=0.4)
                 axis.plot(100 * result.success.rate, at, "o", color=side.colour)
         axis.set_yticks(range(len(sides)), names, color=INK)
         axis.set(xlim=(-2, 102), xlabel="success [%]", ylim=(len(sides) - 0.3, -0.7))

@@ -16,7 +16,7 @@ from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
-from manip_il.evaluation.tables import CLONING, EXPERT, Table
+from manip_il.evaluation.tables import CLONING, EXPERT, INTERVAL, Table
 from manip_il.option import NameOrPath
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
@@ -172,7 +172,7 @@ def verdict(check: RobotCheck) -> str:
 
 def task_table(check: RobotCheck) -> Table:
     """Return the table of tasks: starts, and the expert's success without and with random actions."""
-    columns = ("task", "starts", "expert [95 % interval]", "with random actions")
+    columns = ("task", "starts", f"expert {INTERVAL}", "with random actions")
     rows: list[tuple[str, ...]] = []
     for task in check.tasks:
         tests = (str(one.success) if one else "" for one in (task.clean, task.noisy))

@@ -10,9 +10,8 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from manip_il.errors import printable
-from manip_il.evaluation.intervals import CONFIDENCE
 
-INTERVAL = f"[{CONFIDENCE:.0%} interval]".replace("%", " %")  # part of a column's header
+INTERVAL = "[95 % interval]"  # part of a column's header; see `CONFIDENCE`
 # after Okabe and Ito's palette, distinguishable with every kind of colour blindness
 DAGGER, CLONING, EXPERT, BASELINE = "#0072b2", "#d55e00", "#00835f", "#868e98"
 _PLAIN_WIDTH = 240  # files and pipes have no width to wrap lines at

@@ -116,7 +116,7 @@ def test_a_row_holds_what_the_side_had_cost_and_how_it_did():
         "validation": "100.0 % (100.0, 100.0)",
         "test": "80.0 % (80.0, 80.0)",
         "test, against cloning": "+30.0 points [+30.0, +30.0], p < 0.001",
-        "labels to 90 % of validation": "200",
+        "labels to 90 %": "200",
     }
     assert row(STUDY, "cloning")["test, against cloning"] == ""
 

@@ -10,7 +10,7 @@ from manip_il.evaluation.figures import rates_figure
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.side import Member, Side
 
-from .made_evals import far_corner, made_eval, made_pair
+from .made_evals import made_eval, made_pair, often, seldom
 from .page import EVIL, Page, page_of
 from .test_rounds import RUN
 
@@ -19,7 +19,7 @@ MP4 = b"\0\0\0\x18ftypisom" + b"\0" * 20
 FILMS = [Film("Seed 3", MP4), Film("Seed 4", MP4)]
 RESULT = made_eval()
 REPORT = eval_report(RESULT, COMMAND, {"eval": {"n_episodes": 120}}, FILMS)
-SELDOM = made_pair(far_corner, lambda number, _: number % 37 == 0)
+SELDOM = made_pair(often, seldom)
 
 
 @pytest.fixture(scope="module")
