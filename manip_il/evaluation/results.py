@@ -112,8 +112,8 @@ class EvalSettings:
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
         """Return the inverse of `to_json`; raises what `EpisodeResult.from_json` does. Other keys are ignored."""
         values = {field.name: data[field.name] for field in fields(cls)}
-        conditions = tuple(Condition(**one) for one in values["conditions"])
-        return cls(**values | {"conditions": conditions})
+        values["conditions"] = tuple(Condition(**one) for one in values["conditions"])
+        return cls(**values)
 
 
 @dataclass(frozen=True)
