@@ -31,6 +31,7 @@ from manip_il.data.dataset import Dataset, Own, StoredEpisode
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.side import Side
 from manip_il.learn.reward import LearnedReward
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.preferences.fitting import TIE, true_difference
@@ -74,7 +75,7 @@ def measure(folder: Path, task: str, *, quick: bool) -> int:
     weights = f"--weights={folder / 'scores' / 'rabc.parquet'}"
     sources = {"weighted": f"{half} {weights}", "as it is": half, "demonstrations alone": folder / "good"}
     results = {name: clone(folder, name, source, steps, seeds) for name, source in sources.items()}
-    compared = Comparison("as it is", "weighted", ((results["as it is"], results["weighted"]),))
+    compared = Comparison(*(Side.of(name, results[name]) for name in ("as it is", "weighted")))
     agreement = float(np.mean([one.rate for one in agreements]))
     print(f"agreement with true progress on pairs that nobody answered: mean {agreement:.1%}")
     print("\n".join(f"  draw {draw}: {one} of {one.n:,}" for draw, one in enumerate(agreements)))

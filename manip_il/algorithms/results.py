@@ -12,11 +12,11 @@ from typing import Any, Literal
 from manip_il.errors import ManipError
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.eval_report import run_report
-from manip_il.evaluation.figures import CLONING, DAGGER, Curve
 from manip_il.evaluation.report import Report
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
 from manip_il.evaluation.rounds import history
-from manip_il.evaluation.tables import PolicyRow
+from manip_il.evaluation.side import Member, Side
+from manip_il.evaluation.tables import CLONING, DAGGER
 from manip_il.mdp import Episode
 
 STAGES = ("collect", "fit", "validate")
@@ -121,15 +121,15 @@ def learning_report(
 ) -> Report:
     """Return the report of a run. found: validations by iteration, at least one. records: lines of metrics.jsonl."""
     best, names = best_validation(found), {number: f"iteration {number}" for number in found} | {0: "initial policy"}
+    sides = {
+        number: Side.of(names[number], result, colour=DAGGER if number else CLONING) for number, result in found.items()
+    }
     facts = ["The best policy was chosen on these episodes, which overestimate it; measure it with manip-il eval."]
     if 0 in found and best:
-        facts.insert(0, Comparison(names[0], names[best], ((found[0], found[best]),)).verdict)
+        facts.insert(0, Comparison(sides[0], sides[best]).verdict)
     return run_report(
-        [
-            PolicyRow(names[number], found[number], colour=DAGGER if number else CLONING)
-            for number in sorted({min(found), best, max(found)})
-        ],
-        curves=[Curve(title, (history(records, title),), costs=("steps", "seconds"))],
+        [sides[number] for number in sorted({min(found), best, max(found)})],
+        [Side(title, (Member(Path(title), history=history(records, title)),))],
         title=title,
         verdict=f"Best {names[best]}: validation success {found[best].success}.",
         facts=tuple(facts),

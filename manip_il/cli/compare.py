@@ -25,9 +25,8 @@ from manip_il.seeding import MAX_SEED, stream_seeds
 from manip_il.tasks.config import EnvConfig
 
 if TYPE_CHECKING:
-    from manip_il.evaluation.arm import Arm
-    from manip_il.evaluation.comparison import Study
     from manip_il.evaluation.runner import Trial
+    from manip_il.evaluation.side import Side
 
 _YAML = (".yaml", ".yml")
 _OF_STUDY = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study sets
@@ -116,80 +115,88 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
                 raise UsageError(f"options of {name} {why}")
 
     def _run_study(self, path: Path) -> None:
-        from manip_il.evaluation.arm import read_arm, select_rounds
-        from manip_il.evaluation.comparison import Study
         from manip_il.evaluation.rounds import Rule
+        from manip_il.evaluation.side import read_side, select_rounds
 
         plan = read_plan(path, self.training_seeds, self.trust)
         file = plan.file
         with self.output.open(file, path) as folder:
             plan.run(folder, self.engine)
-            arms = [replace(read_arm(folder / name), name=name) for name in plan.arms]
-            rule, arms = select_rounds(Rule(file.checkpoint, file.at), arms)
-            if plan.baseline:  # all arms have one environment, and the same conditions
-                trials = [self._trial(plan.envs[plan.baseline], arms, file.eval.n_episodes)] * len(arms)
-            else:
-                trials = [self._trial(plan.envs[arm.name], [arm], file.eval.n_episodes) for arm in arms]
-            study = Study(self._measure(arms, trials, folder), plan.baseline, rule, file.target)
-            result = study.arms[0].members[0].test
-            what = f"{result.robot} {result.task}" if plan.baseline else result.robot
-            self._report(study, folder, f"Study: {what}, {path.stem}", to_plain(file))
+            rule, sides = select_rounds(
+                Rule(file.checkpoint, file.at), [read_side(folder / name, name) for name in plan.arms]
+            )
+            trials = self._trials(sides, plan.envs, file.eval.n_episodes)
+            self._report(sides, trials, folder, (plan.baseline, rule, file.target), f"Study: {path.stem}", file)
 
     def _compare(self, left: Path, right: Path) -> None:
-        from manip_il.evaluation.arm import read_arm, require_pair, select_rounds
         from manip_il.evaluation.comparison import Study
         from manip_il.evaluation.rounds import Rule
+        from manip_il.evaluation.side import read_side, require_pair, select_rounds
 
-        both = (read_arm(left), read_arm(right))
+        both = (read_side(left), read_side(right))
         require_pair(*both)
         rule, both = select_rounds(Rule(self.checkpoint, self.at), both)
-        first, *others = [member for arm in both for member in arm.members]
-        trial = None if first.result else self._trial(self._env(both), both, self.eval.n_episodes)
-        if trial is None:
+        first, *others = [member for side in both for member in side.members]
+        trials: Sequence[Trial] = ()
+        if first.result:
             self._refuse("change nothing for two evaluations; give two policies", "eval", "env", "suite", "seed")
-            _ = Study(both, both[0].name, rule).comparisons  # raises unless they can be compared
+            Study(both, both[0].name)  # raises unless they can be compared
             for other in others:
                 warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
+        else:
+            envs = dict.fromkeys((side.name for side in both), self._env(both))
+            trials = self._trials(both, envs, self.eval.n_episodes)
         with self.output.open(self) as folder:
-            measured = self._measure(both, [trial] * 2, folder) if trial else both
-            study, test = Study(measured, measured[0].name, rule), measured[0].members[0].test
-            self._report(study, folder, f"{left} against {right}: {test.robot} {test.task}", to_plain(self))
+            self._report(both, trials, folder, (both[0].name, rule), f"{left} against {right}", self)
 
-    def _env(self, arms: Sequence[Arm]) -> EnvConfig:
-        """Return the test environment of all arms: that of the runs, else that of the policies."""
-        from manip_il.evaluation.arm import require_same_env
+    def _env(self, sides: Sequence[Side]) -> EnvConfig:
+        """Return the test environment of all sides: that of the runs, else that of the policies."""
+        from manip_il.evaluation.side import require_same_env
 
         given = {name: value for name, value in self.env.items() if value is not None}
-        members = [member for arm in arms for member in arm.members]
+        members = [member for side in sides for member in side.members]
         if runs := [member for member in members if member.history]:
             own = [given.pop(name, None) for name in ("robot", "task", "object")]
-            return require_same_env({run.name: replace(run.env(*own), **given) for run in runs})
+            return require_same_env({run.name: replace(run.validation.env(*own), **given) for run in runs})
         origins = {one.name: Checkpoint.open(one.policy).origin for one in members if one.policy is not None}
         return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
 
-    def _trial(self, env: EnvConfig, arms: Sequence[Arm], n_episodes: int) -> Trial:
-        """Return the test of these arms; raises, before any episode runs, if a policy does not fit the environment."""
+    def _trials(self, sides: Sequence[Side], envs: Mapping[str, EnvConfig], n_episodes: int) -> list[Trial]:
+        """Return the test of each side; raises, before any episode runs, if a policy does not fit its environment."""
         from manip_il.cli.inputs import check_policy
         from manip_il.evaluation.runner import Trial
 
-        policies = [one.policy for arm in arms for one in arm.members if one.policy is not None]
-        for policy in policies:
-            check_policy(Checkpoint.open(policy), env, trust=self.trust)
-        return Trial.of(env, stream_seeds("test", n_episodes, self.seed), self.suite, policies, self.trust)
+        policies = list[Path]()
+        for side in sides:
+            for policy in side.policies:
+                check_policy(Checkpoint.open(policy), envs[side.name], trust=self.trust)
+                policies.append(policy)
+        seeds = stream_seeds("test", n_episodes, self.seed)
+        return [Trial.of(envs[side.name], seeds, self.suite, policies, self.trust) for side in sides]
 
-    def _measure(self, arms: Sequence[Arm], trials: Sequence[Trial], folder: Path) -> tuple[Arm, ...]:
-        """Return the arms with the results of their tests."""
-        with Stages(f"every finished episode, in {folder}") as stages, self.engine.open() as engine:
-            pairs = zip(arms, trials, strict=True)
-            return tuple(arm.measure(trial, folder, engine, stages) for arm, trial in pairs)
+    def _report(
+        self,
+        sides: Sequence[Side],
+        trials: Sequence[Trial],
+        folder: Path,
+        how: tuple[Any, ...],
+        title: str,
+        config: ComparisonOptions,
+    ) -> None:
+        """Run the tests, write the result and the report, print the tables and the verdict.
 
-    def _report(self, study: Study, folder: Path, title: str, config: Mapping[str, Any]) -> None:
-        """Write the result and the report, print the tables and the verdict."""
-        from manip_il.evaluation.comparison import FILE_NAME
+        trials: of each side; none if they are evaluations. how: what `Study` takes after its sides.
+        """
+        from manip_il.evaluation.comparison import FILE_NAME, Study
         from manip_il.evaluation.eval_report import compare_report
 
-        page = compare_report(study, title, command_line(), config)
-        publish(folder / FILE_NAME, study.to_json(), study.tables, study.verdict, *study.facts, page=page)
+        if trials:
+            with Stages(f"every finished episode, in {folder}") as stages, self.engine.open() as engine:
+                pairs = zip(sides, trials, strict=True)
+                sides = [side.measure(trial, folder, engine, stages) for side, trial in pairs]
+        study = Study(tuple(sides), *how)
+        page = compare_report(study, title, command_line(), to_plain(config))
+        publish(folder / FILE_NAME, study.to_json(), [study.table()], study.verdict, *study.facts, page=page)
 
 
 class StudyPlan(NamedTuple):
@@ -216,7 +223,7 @@ def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False
 
     training_seeds: replaces the number in the file. trust: `--trust` for every run.
     """
-    from manip_il.evaluation.arm import require_same_env
+    from manip_il.evaluation.side import require_same_env
 
     file = from_yaml(path, StudyFile)
     file = replace(file, training_seeds=training_seeds or file.training_seeds)

@@ -12,7 +12,6 @@ from manip_il.cli.options import Given, command_line, given, group, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput
 from manip_il.cli.progress import Stages, say, say_next
 from manip_il.data.atomic import write_json
-from manip_il.data.json_lines import read_lines
 from manip_il.evaluation.suites import varied
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
@@ -23,7 +22,7 @@ from manip_il.tasks.config import EnvConfig
 if TYPE_CHECKING:
     from manip_il.algorithms.results import Result
     from manip_il.collect.workers import Engine
-    from manip_il.evaluation.tables import PolicyRow
+    from manip_il.evaluation.side import Side
 
 _OF_FIT = ("policy", "action_space", "observation", "steps", "batch_size", "lr", "optimizer", "scheduler")
 
@@ -104,24 +103,25 @@ class DaggerOptions(Varied, Trusting):
         """Write the report of a run."""
         from manip_il.algorithms.results import best_result
         from manip_il.evaluation.comparison import Comparison
-        from manip_il.evaluation.tables import CLONING, DAGGER, PolicyRow
+        from manip_il.evaluation.side import Side
+        from manip_il.evaluation.tables import CLONING, DAGGER
 
         best, kind = best_result(results), ALGORITHMS[config.method]
         first = "cloning" if config.start is None else "the policy given"
         names = [f"{first} (round 0)", *(f"{kind}, round {result.number}" for result in results[1:])]
-        rows = [
-            PolicyRow(name, result.validation, result.labels, colour=DAGGER if result.number else CLONING)
+        sides = [
+            Side.of(name, result.validation, labels=result.labels, colour=DAGGER if result.number else CLONING)
             for name, result in zip(names, results, strict=True)
         ]
         success, facts = best.validation.success, tuple[str, ...]()
         if best.number > 0:
-            comparison = Comparison(names[0], names[best.number], ((results[0].validation, best.validation),))
-            facts = (f"{comparison.verdict} The best round was chosen on these episodes, so its success is biased up.",)
+            verdict = Comparison(sides[0], sides[best.number]).verdict
+            facts = (f"{verdict} The best round was chosen on these episodes, so its success is biased up.",)
         chosen = f"{names[best.number]}, best of {len(results)}"
         write_page(
             folder,
             folder,
-            rows,
+            sides,
             kind,
             title=f"{kind} on {config.env.robot} {config.env.task}",
             verdict=f"{chosen}: {success} success on {success.n:,} validation episodes.",
@@ -147,15 +147,13 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     return results
 
 
-def write_page(folder: Path, run: Path, rows: list[PolicyRow], kind: str, **parts: Any) -> None:
+def write_page(folder: Path, run: Path, sides: list[Side], kind: str, **parts: Any) -> None:
     """Write to `folder` the report on the policies of `run`: their table, and curves of success over cost.
 
     kind: the algorithm's name. parts: see `run_report`.
     """
     from manip_il.evaluation.eval_report import run_report
-    from manip_il.evaluation.figures import Curve
-    from manip_il.evaluation.rounds import METRICS_FILE, history
+    from manip_il.evaluation.side import Side, read_member
 
-    curve = Curve(kind, (history(read_lines(run / METRICS_FILE), str(run)),))
-    page = run_report(rows, curves=[curve], fingerprint=rows[-1].result.fingerprint, **parts)
+    page = run_report(sides, [Side(kind, (read_member(run),))], fingerprint=sides[-1].results[0].fingerprint, **parts)
     page.write(folder / REPORT_FILE)

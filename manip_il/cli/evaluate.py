@@ -130,12 +130,11 @@ class EvalOptions(Tested, Seeded, Trusting):
 
     def _report(self, result: EvalResult, folder: Path, films: Sequence[Film] = (), no_films: str = "") -> None:
         """Write the result and its report, and print its tables."""
-        from manip_il.evaluation.eval_report import eval_report
+        from manip_il.evaluation.eval_report import condition_sides, eval_report, success_table
         from manip_il.evaluation.results import FILE_NAME
-        from manip_il.evaluation.tables import evaluation_table
 
         page = eval_report(result, command_line(), to_plain(self), films, no_films)
-        publish(folder / FILE_NAME, result.to_json(), [evaluation_table(result)], page=page)
+        publish(folder / FILE_NAME, result.to_json(), [success_table(condition_sides(result))], page=page)
 
     def _merge(self) -> None:
         """Merge evaluations; warn if they were made with different versions or models."""
@@ -189,7 +188,7 @@ class EvalOptions(Tested, Seeded, Trusting):
         from manip_il.evaluation.results import require_equal
 
         settings, own = result.settings, self.env
-        env = settings.env(own["robot"] or result.robot, own["task"] or result.task, own["object"])
+        env = result.env(own["robot"], own["task"], own["object"])
         require_equal(str(file), result, "what is given", env_spec(env), "robot", "task")
         if self.policy.path is None and result.policy not in NO_FILES:
             raise UsageError(f"{file} evaluates the policy {shorten(result.policy)}; give that with --policy.path=DIR")

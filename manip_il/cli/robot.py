@@ -93,9 +93,9 @@ class RobotCheckOptions:
                 found = robot_check.check_robot(self.robot, tasks, self.episodes, engine, lambda _: bar.step())
             write_json(folder / robot_check.FILE_NAME, found.to_json())
             try:
-                pictures, no_pictures = robot_check.looks(self.robot), ""
+                pictures, no_pictures = [robot_check.looks(self.robot)], ""
             except RenderError as error:
-                pictures, no_pictures = (), str(error)
+                pictures, no_pictures = [], str(error)
             page = robot_check.check_report(found, pictures, no_pictures, command_line(), to_plain(self))
             page.write(folder / PAGE)
         print_table(robot_check.task_table(found))

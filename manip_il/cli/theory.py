@@ -47,15 +47,15 @@ class TheoryOptions:
             publish(folder / FILE_NAME, theory.to_json(), [slope_table(theory)], fact, page=page)
 
     def _shift(self, run: Path) -> Shift:
-        from manip_il.evaluation.arm import read_arm
         from manip_il.evaluation.certify import certify, count_episodes
+        from manip_il.evaluation.side import read_member
         from manip_il.theory.shift import find_rounds, measure_shift
 
         rounds = find_rounds(run)
-        member = read_arm(run).members[0]
-        env = member.env()
+        validation = read_member(run).validation
+        env = validation.env()
         count = count_episodes(env, self.cases) + self.episodes * (1 + len(rounds))
         with progress(count, f"theory {run}") as bar, self.engine.open() as engine:
             certificate = certify(engine, env, self.cases, on_episode=lambda _: bar.step())
-            u, conditions = certificate.mu or 0, member.conditions
+            u, conditions = certificate.mu or 0, validation.settings.conditions
             return measure_shift(engine, env, rounds, u, self.episodes, lambda _: bar.step(), conditions)

@@ -1,4 +1,4 @@
-"""Comparison of arms on the same test episodes: which one is better, and what each cost."""
+"""Comparison of sides on the same test episodes: which one is better, and what each cost."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from statistics import fmean
 from typing import Any
 
 from manip_il.errors import ManipError
-from manip_il.evaluation.arm import Arm
 from manip_il.evaluation.intervals import (
     CONFIDENCE,
     PairCounts,
@@ -21,49 +20,38 @@ from manip_il.evaluation.intervals import (
     mean_interval,
     sign_flip_exact,
 )
-from manip_il.evaluation.results import EvalResult, require_comparable
-from manip_il.evaluation.rounds import COSTS, Cost, Round, Rule, format_amount, has_unlabelled_steps
+from manip_il.evaluation.results import require_comparable
+from manip_il.evaluation.rounds import Cost, Round, Rule, costs_of
+from manip_il.evaluation.side import Side
 from manip_il.evaluation.tables import Table
 
 FILE_NAME = "compare.json"
-TARGET = 0.95
 
 
 @dataclass(frozen=True)
 class Comparison:
     """`right` against `left`, paired by training seed and by test episode. Differences are right minus left.
 
-    results: (left, right) for each training seed; episodes that only one side ran do not count. Raises
-    `MismatchError` if robot, task or settings differ, `ManipError` if left and right share no episode.
+    Episodes that only one side ran do not count. Raises `MismatchError` if robot, task or settings differ, `ManipError`
+    if left and right share no episode.
     """
 
-    left: str
-    right: str
-    results: tuple[tuple[EvalResult, EvalResult], ...]
+    left: Side
+    right: Side
 
     def __post_init__(self) -> None:
-        for left, right in self.results:
-            require_comparable(self.left, left, self.right, right)
+        for one, other in zip(self.left.results, self.right.results, strict=True):
+            require_comparable(self.left.name, one, self.right.name, other)
         if not all(self._outcomes):
-            raise ManipError(f"{self.left} and {self.right} share no seed; evaluate both with the same --seed=")
-
-    @classmethod
-    def of(cls, left: Arm, right: Arm) -> Comparison:
-        """Compare two arms. Raises what `Comparison` does; `ManipError` unless all policies ran the same episodes."""
-        members = (*left.members, *right.members)
-        if len({frozenset(episode.seed for episode in one.test.episodes) for one in members}) > 1:
             raise ManipError(
-                f"test episodes of {left.name} and {right.name} differ; evaluate both with the same --seed and "
-                "--eval.n_episodes"
+                f"{self.left.name} and {self.right.name} share no seed; evaluate both with the same --seed="
             )
-        pairs = zip(left.members, right.members, strict=True)
-        return cls(left.name, right.name, tuple((one.test, other.test) for one, other in pairs))
 
     @cached_property
     def _outcomes(self) -> list[dict[int, tuple[bool, bool]]]:
         """Outcomes (left, right) by test episode, for each training seed."""
         found: list[dict[int, tuple[bool, bool]]] = []
-        for left, right in self.results:
+        for left, right in zip(self.left.results, self.right.results, strict=True):
             theirs = {episode.seed: episode.success for episode in right.episodes}
             ours = (one for one in left.episodes if one.seed in theirs)
             found.append({one.seed: (one.success, theirs[one.seed]) for one in ours})
@@ -99,31 +87,31 @@ class Comparison:
 
     @property
     def significant(self) -> bool:
-        """Whether one arm is better by the exact test and, with several training seeds, also by the t interval."""
+        """Whether one side is better by the exact test and, with several training seeds, also by the t interval."""
         low, high = self.interval
         return self.p_value < 1 - CONFIDENCE and (len(self.pairs) == 1 or low > 0 or high < 0)
 
     @property
     def verdict(self) -> str:
-        """A sentence: which arm is better, or that neither is shown to be better, with difference, interval and p."""
+        """A sentence: which side is better, or that neither is shown to be better, with difference, interval and p."""
         n, sign = len(self.pairs), -1 if self.difference < 0 else 1
         leads = sum(sign * pair.difference > 0 for pair in self.pairs)
         tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes"
         tested += f" on each of {n} training seeds, ahead in {leads}" if n > 1 else ""
         if not self.significant:
             points = format_points(self.difference, self.interval)
-            return f"No difference shown between {self.right} and {self.left}: {points}, {tested}."
+            return f"No difference shown between {self.right.name} and {self.left.name}: {points}, {tested}."
         better, worse = (self.left, self.right) if sign < 0 else (self.right, self.left)
         low, high = sorted(100 * sign * end for end in self.interval)
         points = f"{100 * abs(self.difference):.1f} points [{low:.1f}, {high:.1f}]"
-        return f"{better} is better than {worse} by {points}, {tested}."
+        return f"{better.name} is better than {worse.name} by {points}, {tested}."
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; differences are right minus left."""
         counts = ("both", "only_left", "only_right", "neither")
         return {
-            "left": self.left,
-            "right": self.right,
+            "left": self.left.name,
+            "right": self.right.name,
             "difference": self.difference,
             "interval": list(self.interval),
             "confidence": CONFIDENCE,
@@ -137,102 +125,87 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Study:
-    """Tested arms with the same training seeds, and what they cost.
+    """Tested sides with the same training seeds, and what they cost.
 
-    baseline: the arm that the others are compared with; None for arms of different tasks. rule: how each run's round
+    baseline: the side that the others are compared with; None for sides of different tasks. rule: how each run's round
     was chosen. target: validation success for which the cost is reported.
+
+    Raises what `Comparison` raises, and `ManipError` unless all sides of a comparison ran the same episodes.
     """
 
-    arms: tuple[Arm, ...]
+    sides: tuple[Side, ...]
     baseline: str | None
     rule: Rule = field(default_factory=Rule)
-    target: float = TARGET
+    target: float = 0.95
+
+    def __post_init__(self) -> None:
+        for one in self.comparisons.values():
+            ran = {frozenset(episode.seed for episode in it.episodes) for it in one.left.results + one.right.results}
+            if len(ran) > 1:
+                raise ManipError(
+                    f"test episodes of {one.left.name} and {one.right.name} differ; evaluate both with the same --seed "
+                    "and --eval.n_episodes"
+                )
 
     @cached_property
     def comparisons(self) -> dict[str, Comparison]:
-        """Arm -> its comparison with the baseline, for every other arm; empty without a baseline."""
+        """Side -> its comparison with the baseline, for every other side; empty without a baseline."""
         if self.baseline is None:
             return {}
-        baseline = next(arm for arm in self.arms if arm.name == self.baseline)
-        return {arm.name: Comparison.of(baseline, arm) for arm in self.arms if arm is not baseline}
+        baseline = next(side for side in self.sides if side.name == self.baseline)
+        return {side.name: Comparison(baseline, side) for side in self.sides if side is not baseline}
 
     @property
     def verdict(self) -> str:
-        """The first sentence: the better of two arms, the best of several, or how many tasks reach the target."""
+        """The first sentence: the better of two sides, or how well each of several does, the best one first."""
         if len(self.comparisons) == 1:
             return next(iter(self.comparisons.values())).verdict
-        ranked = sorted(self.arms, key=lambda arm: -arm.test_rate)
-        best, last, seeds = ranked[0], ranked[-1], len(self.arms[0].members)
-        if self.baseline is None:
-            reach = sum(arm.test_rate >= self.target for arm in ranked)
-            least = f"the last, {last.name}, solves {format_percent(last.test_rate)}"
-            return f"{reach} of {len(ranked)} solve {100 * self.target:g} % of their unseen starts; {least}."
+        best, *others = sorted(self.sides, key=lambda side: -side.rate)
+        n, seeds = best.results[0].success.n, len(best.members)
         over = f", the mean of {seeds} training seeds" if seeds > 1 else ""
-        rates = ", ".join(f"{arm.name} {format_percent(arm.test_rate)}" for arm in ranked[1:])
-        n = best.members[0].test.success.n
-        return f"{best.name} solves {format_percent(best.test_rate)} of {n:,} unseen starts{over}; {rates}."
+        rates = ", ".join(f"{side.name} {format_percent(side.rate)}" for side in others)
+        return f"{best.name} solves {format_percent(best.rate)} of {n:,} unseen starts{over}; {rates}."
 
     @property
     def facts(self) -> list[str]:
         """Return the sentences after the verdict: comparisons with the baseline, and how rounds were chosen."""
         verdicts = [comparison.verdict for comparison in self.comparisons.values()]
         facts = verdicts if len(verdicts) > 1 else []
-        if self.comparisons and (seeds := len(self.arms[0].members)) > 1:
-            facts.append(
-                f"Intervals are Student's over {seeds} training seeds; p is exact over test episodes and holds for "
-                "these policies alone."
-            )
-        if any(member.chosen for arm in self.arms for member in arm.members):
+        if self.comparisons and len(self.sides[0].members) > 1:
+            facts.append("Intervals are Student's over training seeds; p is exact and holds for these policies alone.")
+        if any(member.chosen for side in self.sides for member in side.members):
             facts.append(self.rule.fact)
         return facts
 
-    @property
-    def tables(self) -> tuple[Table, ...]:
-        """The results, and the costs to reach the target if all arms are runs."""
-        runs = all(arm.has_histories for arm in self.arms)
-        return (self.results_table(), self.target_table()) if runs else (self.results_table(),)
-
-    def results_table(self) -> Table:
-        """Return one row per arm: mean costs, validation, test success, difference.
+    def table(self) -> Table:
+        """Return one row per side: mean costs, validation, test success, difference, cost to the target on validation.
 
         Brackets hold the values of each training seed or, for a single seed, the interval.
         """
         rows: list[tuple[str, ...]] = []
-        for arm in self.arms:
-            against, chosen = self.comparisons.get(arm.name), [one.chosen for one in arm.members if one.chosen]
-            cells = [_mean_cost(cost, chosen) if chosen else "" for cost in self._costs]
+        costs = costs_of(member.history for side in self.sides for member in side.members)
+        for side in self.sides:
+            against, chosen = self.comparisons.get(side.name), [one.chosen for one in side.members if one.chosen]
+            cells = [_mean_cost(cost, chosen) if chosen else "" for cost in costs]
             cells.append(_rates([one.validation for one in chosen]) if chosen else "")
-            cells.append(_rates([one.test.success for one in arm.members]))
+            cells.append(_rates([result.success for result in side.results]))
             points = against and f"{format_points(against.difference, against.interval)}, {format_p(against.p_value)}"
-            rows.append((arm.name, *cells, points or ""))
-        head = ("arm", *map(_head, self._costs), "validation", "test", f"test, against {self.baseline}")
-        return Table(head, tuple(rows))
+            reached = "not reached" if side.histories else ""
+            if None not in (first := self._reached(side)):
+                reached = _mean_cost(costs[0], first)
+            rows.append((side.name, *cells, points or "", reached))
+        head = ("side", *costs, "validation", "test", f"test, against {self.baseline}")
+        return Table((*head, f"{costs[0]} to {100 * self.target:g} %"), tuple(rows))
 
-    def target_table(self) -> Table:
-        """Return one row per arm: its mean costs when validation first reached the target in each training seed."""
-        rows: list[tuple[str, ...]] = []
-        for arm in self.arms:
-            first = self._reached(arm)
-            missed = f"not reached in {first.count(None)} of {len(first)} seeds"
-            rows.append((arm.name, *(missed if None in first else _mean_cost(cost, first) for cost in self._costs)))
-        head = (f"{_head(cost)} to {100 * self.target:g} %" for cost in self._costs)
-        return Table(("arm, validation", *head), tuple(rows))
-
-    @property
-    def _costs(self) -> list[Cost]:
-        """The costs shown in tables; steps only if some have no label."""
-        steps = any(has_unlabelled_steps(member.history) for arm in self.arms for member in arm.members)
-        return [cost for cost in COSTS if cost != "steps" or steps]
-
-    def _reached(self, arm: Arm) -> list[Round | None]:
+    def _reached(self, side: Side) -> list[Round | None]:
         """Return, for each training seed, the round in which validation first reached the target."""
         return [
-            next((one for one in member.history if one.validation.rate >= self.target), None) for member in arm.members
+            next((one for one in member.history if one.validation.rate >= self.target), None) for member in side.members
         ]
 
     def to_json(self) -> dict[str, Any]:
         """Return the contents of `compare.json`."""
-        result = self.arms[0].members[0].test
+        result = self.sides[0].results[0]
         seeds = [episode.seed for episode in result.episodes]
         return {
             "verdict": self.verdict,
@@ -240,32 +213,28 @@ class Study:
             "baseline": self.baseline,
             "target": self.target,
             "rule": {"checkpoint": self.rule.checkpoint, "at": self.rule.at, "limit": self.rule.limit},
-            "arms": {arm.name: self._arm_json(arm) for arm in self.arms},
+            "arms": {side.name: self._side_json(side) for side in self.sides},
             "robot": result.robot,
             "test_seeds": [min(seeds), max(seeds)],
         }
 
-    def _arm_json(self, arm: Arm) -> dict[str, Any]:
-        against, test = self.comparisons.get(arm.name), arm.members[0].test
+    def _side_json(self, side: Side) -> dict[str, Any]:
+        against, test = self.comparisons.get(side.name), side.results[0]
         return {
             "task": test.task,
             "settings": test.settings.to_json(),
-            "test_success": arm.test_rate,
+            "test_success": side.rate,
             "against_baseline": against.to_json() if against else None,
             "training_seeds": [
                 member.to_json() | {"first_at_target": first.to_json() if first else None}
-                for member, first in zip(arm.members, self._reached(arm), strict=True)
+                for member, first in zip(side.members, self._reached(side), strict=True)
             ],
         }
 
 
-def _head(cost: Cost) -> str:
-    return "wall-clock" if cost == "seconds" else cost
-
-
 def _mean_cost(cost: Cost, rounds: Sequence[Round | None]) -> str:
     """Return the mean amount without its unit, which is in the column's header."""
-    return format_amount(cost, fmean(one.amount(cost) for one in rounds if one)).removesuffix(f" {cost}")
+    return f"{fmean(one.amount(cost) for one in rounds if one):,.0f}"
 
 
 def _rates(found: Sequence[Proportion]) -> str:

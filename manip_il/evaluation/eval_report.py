@@ -2,143 +2,117 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from typing import Any
 
 from manip_il.evaluation.comparison import Study
-from manip_il.evaluation.figures import (
-    ARMS,
-    Bar,
-    Curve,
-    Figure,
-    curve_figures,
-    curve_note,
-    rates_figure,
-    start_map,
-)
+from manip_il.evaluation.figures import COLOURS, curve_figures, rates_figure
 from manip_il.evaluation.report import Film, Report, Section
-from manip_il.evaluation.results import EpisodeResult, EvalResult
-from manip_il.evaluation.tables import BASELINE, PolicyRow, Table, evaluation_table, policy_table
-from manip_il.sim.task import phases
+from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.side import Side
+from manip_il.evaluation.tables import BASELINE, INTERVAL, Table
 from manip_il.tasks.stock import table as stock
-from manip_il.tasks.table import TASKS
 
 
 def eval_report(
     result: EvalResult,
     command: str,
-    config: Mapping[str, Any] | None = None,
+    config: Mapping[str, Any],
     films: Sequence[Film] = (),
     no_films: str = "",
 ) -> Report:
     """Return the report of an evaluation. no_films: why there are no films, or empty."""
-    fails = failures_sections(
-        [("failed episodes", result.episodes)], result.task, "Where it fails", start_map(result.episodes)
-    )
-    if result.success.successes == result.success.n:
-        fails = [Section("Where it fails", (f"No failure in {result.success.n:,} episodes.",))]
+    settings, sides = result.settings, condition_sides(result)
+    solved = f"an error of at most {100 * settings.tolerance:g} cm for {settings.success_steps} control steps in a row"
+    if result.robot in stock.ROBOTS:
+        solved = "as the environment itself reports it"
+    end = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
+    note = f"Episodes have at most {settings.horizon:,} control steps. Success: {solved}{end}."
+    if result.until_width is not None:
+        note += " Intervals are from a confidence sequence, which is valid whenever the evaluation stops."
     return Report(
         title=f"Evaluation of {result.policy}: {result.robot} {result.task}",
         verdict=evaluation_verdict(result),
         command=command,
-        sections=(_conditions(result), *fails, *_looks(films, no_films)),
-        config=config or {},
+        sections=(
+            _results(sides, success_table(sides), note, result),
+            *_failures([Side.of("failed episodes", result)]),
+            *_films(films, no_films),
+        ),
+        config=config,
         fingerprint=result.fingerprint,
     )
 
 
 def run_report(
-    rows: Sequence[PolicyRow],
-    films: Sequence[Film] = (),
-    no_films: str = "",
-    curves: Sequence[Curve] = (),
-    **parts: Any,
+    sides: Sequence[Side], runs: Sequence[Side], films: Sequence[Film] = (), no_films: str = "", **parts: Any
 ) -> Report:
-    """Return the report of a run's policies, one per row. parts: other fields of `Report`, such as the title."""
-    note = f"Each policy ran {rows[0].result.success.n:,} episodes. Intervals are Wilson's score intervals."
-    note += next((disturbed_note(row.disturbed) for row in rows if row.disturbed), "")
-    bars = [Bar(row.name, (row.result.success,), row.colour) for row in rows]
-    results = Section("Results", figures=(rates_figure(bars),), tables=(policy_table(rows),), notes=(note,))
-    return Report(sections=(results, *curve_sections(curves), *_looks(films, no_films)), **parts)
+    """Return the report of a run's policies, one per side.
+
+    runs: whose rounds are drawn as curves. parts: other fields of `Report`, such as the title.
+    """
+    tested = next((side.disturbed for side in sides if side.disturbed), sides[0].results[0])
+    results = _results(sides, success_table(sides), "", tested)
+    return Report(sections=(results, *_curves(runs), *_films(films, no_films)), **parts)
 
 
-def compare_report(study: Study, title: str, command: str, config: Mapping[str, Any] | None = None) -> Report:
-    """Return the report of a comparison of arms."""
-    others = [arm.name for arm in study.arms if arm.name != study.baseline]
-    palette = {name: ARMS[place % len(ARMS)] for place, name in enumerate(others)}
-    colours = {arm.name: palette.get(arm.name, BASELINE) for arm in study.arms}
-    first = study.arms[0].members[0].test
-    of_arms = tuple(colours.values())
-    results, *costs = (replace(table, colours=of_arms) for table in study.tables)
-    bars = [Bar(arm.name, tuple(one.test.success for one in arm.members), colours[arm.name]) for arm in study.arms]
-    same = "the same " if study.baseline is not None else ""
-    note = f"Every policy ran {same}{first.success.n:,} test episodes, which were not used to select a policy."
-    note += disturbed_note(first)
-    if len(bars[0].successes) > 1:
-        note += " In brackets and as dots: each training seed; the bar is their mean."
-    sections = [Section("Results", figures=(rates_figure(bars),), tables=(results,), notes=(note,))]
-    if study.baseline is not None:
-        failed = [(arm.name, [*chain(*(one.test.episodes for one in arm.members))]) for arm in study.arms]
-        sections += failures_sections(failed, first.task, "Where they fail")
-    curves = [
-        Curve(arm.name, tuple(member.history for member in arm.members), colours[arm.name])
-        for arm in study.arms
-        if arm.has_histories
-    ]
-    sections += curve_sections(curves, study.target if costs else None, tuple(costs))
+def compare_report(study: Study, title: str, command: str, config: Mapping[str, Any]) -> Report:
+    """Return the report of a comparison of sides."""
+    others = [side.name for side in study.sides if side.name != study.baseline]
+    colours = dict(zip(others, itertools.cycle(COLOURS), strict=False))
+    sides = [replace(side, colour=colours.get(side.name, BASELINE)) for side in study.sides]
+    table = replace(study.table(), colours=tuple(side.colour for side in sides))
+    first = sides[0].results[0]
+    note = f"Every policy ran {first.success.n:,} test episodes on the same seeds, which selected no policy."
+    if len(sides[0].members) > 1:
+        note += " In brackets and in the figure: each training seed."
+    failures = _failures(sides) if study.baseline is not None else []
+    curves = _curves([side for side in sides if side.histories], study.target)
+    what = first.robot if study.baseline is None else f"{first.robot} {first.task}"
     return Report(
-        title=title,
+        title=f"{title}: {what}",
         verdict=study.verdict,
         facts=tuple(study.facts),
         command=command,
-        sections=tuple(sections),
-        config=config or {},
+        sections=(_results(sides, table, note, first), *failures, *curves),
+        config=config,
         fingerprint=first.fingerprint,
     )
 
 
-def failures_sections(
-    policies: Sequence[tuple[str, Sequence[EpisodeResult]]], task: str, heading: str, figures: tuple[Figure, ...] = ()
-) -> list[Section]:
-    """Return a section with the figures and `phase_table`, if there are any. policies: name and episodes of each."""
-    table = phase_table(policies, task)
-    if not figures and table is None:
-        return []
-    return [Section(heading, figures=figures, tables=(table,) if table else ())]
+def condition_sides(result: EvalResult) -> list[Side]:
+    """Return an evaluation as the sides of a report: all episodes and, if there are several, each condition's."""
+    conditions = result.by_condition
+    if len(conditions) < 2:
+        return [Side.of(result.policy, result)]
+    parts = [Side.of(name or "without a condition", part) for name, part in conditions.items()]
+    return [Side.of("all conditions", result, colour=BASELINE), *parts]
 
 
-def curve_sections(
-    curves: Sequence[Curve], target: float | None = None, tables: tuple[Table, ...] = ()
-) -> list[Section]:
-    """Return a section on success against every cost; empty if there are no curves."""
-    if not curves:
-        return []
-    note = curve_note(curves)
-    return [Section("Success against cost", figures=curve_figures(curves, target), tables=tables, notes=(note,))]
+def success_table(sides: Sequence[Side]) -> Table:
+    """Return one row per policy or condition, given sides of one evaluation each.
 
-
-def disturbed_note(result: EvalResult) -> str:
-    """Return a sentence on the conditions, with a leading space; empty if there are none."""
-    disturbance = result.settings.disturbance
-    return "" if disturbance == "none" else f" Conditions: {disturbance}."
-
-
-def phase_table(policies: Sequence[tuple[str, Sequence[EpisodeResult]]], task: str) -> Table | None:
-    """Return failed episodes by the phase that they ended in, in the task's order, one column per policy.
-
-    policies: names and episodes. Returns None if none failed or no phase is known.
+    Columns: episodes, expert labels, success, success at the end, control steps to success, success when disturbed.
     """
-    counted = [Counter(e.phase_at_end for e in own if e.phase_at_end and not e.success) for _, own in policies]
-    found = {name for counts in counted for name in counts}
-    if not found:
-        return None
-    known = phases(TASKS[task]) if task in TASKS else ()
-    names = [*known, *sorted(found.difference(known))]
-    rows = ((_spaced(name), *(f"{counts[name]:,}" for counts in counted)) for name in names)
-    return Table(("phase that it ended in", *(name for name, _ in policies)), tuple(rows))
+    rows: list[tuple[str, ...]] = []
+    for side in sides:
+        [result] = side.results
+        rows.append(
+            (
+                side.name,
+                f"{result.success.n:,}",
+                "" if side.labels is None else f"{side.labels:,}",
+                str(result.success),
+                str(result.success_at_end),
+                "" if result.steps_to_success is None else f"{result.steps_to_success:.1f}",
+                str(side.disturbed.success) if side.disturbed else "",
+            )
+        )
+    head = ("", "episodes", "expert labels", f"success {INTERVAL}", "success at end", "steps to success")
+    return Table((*head, "success, disturbed"), tuple(rows), tuple(side.colour for side in sides))
 
 
 def evaluation_verdict(result: EvalResult) -> str:
@@ -146,41 +120,38 @@ def evaluation_verdict(result: EvalResult) -> str:
     success = result.success
     verdict = f"{result.policy} succeeds in {success} of {success.n:,} unseen episodes of {result.robot} {result.task}"
     phase, count = next(iter(result.failures.items()), ("", 0))
-    if not phase:  # nothing failed, or the file is from before phases were kept
+    if not phase:  # nothing failed, or the task has no phases
         return f"{verdict}."
-    return f"{verdict}; {count:,} of its {success.n - success.successes:,} failures end in the phase {_spaced(phase)}."
+    return f"{verdict}; {count:,} of its {success.n - success.successes:,} failures end in the phase {phase}."
 
 
-def _conditions(result: EvalResult) -> Section:
-    """Return a section: success in all episodes and per condition, and what success and the conditions mean."""
-    settings, table = result.settings, evaluation_table(result)
-    successes = [result.success, *(part.success for part in result.by_condition.values())]
-    bars = [
-        Bar(row[0], (success,), colour)
-        # with a single condition, the table has one row
-        for row, success, colour in zip(table.rows, successes, table.colours, strict=False)
-    ]
-    hold = settings.hold
-    ends = {None: "", 0: ", which ends the episode"}.get(hold, f"; an episode ends {hold} steps after it")
-    intervals = "Intervals are Wilson's score intervals."
-    if result.until_width is not None:
-        intervals = "Intervals are from a confidence sequence, which is valid whenever the evaluation stops."
-    solved = f"an error of at most {100 * settings.tolerance:g} cm for {settings.success_steps} control steps in a row"
-    if result.robot in stock.ROBOTS:
-        solved = "as the environment itself reports it"
-    note = (
-        f"{result.success.n:,} episodes of at most {settings.horizon:,} control steps. Success: {solved}{ends}. "
-        f"{intervals}{disturbed_note(result)}"
-    )
-    return Section("Results", figures=(rates_figure(bars),), tables=(table,), notes=(note,))
+def _results(sides: Sequence[Side], table: Table, note: str, tested: EvalResult) -> Section:
+    """Return a section of success rates. tested: an evaluation whose conditions are added to the note."""
+    disturbance = tested.settings.disturbance
+    if disturbance != "none":
+        note = f"{note} Conditions: {disturbance}.".lstrip()
+    return Section("Results", figures=(rates_figure(sides),), tables=(table,), notes=(note,))
 
 
-def _looks(films: Sequence[Film], no_films: str) -> list[Section]:
+def _failures(sides: Sequence[Side]) -> list[Section]:
+    """Return a section with the failed episodes of each side by the phase that they ended in; [] if none failed."""
+    counted = [sum((Counter(result.failures) for result in side.results), Counter[str]()) for side in sides]
+    total = sum(counted, Counter[str]()).most_common()
+    rows = [(phase, *(f"{counts[phase]:,}" for counts in counted)) for phase, _ in total if phase]
+    columns = ("phase that it ended in", *(side.name for side in sides))
+    return [Section("Where they fail", tables=(Table(columns, tuple(rows)),))] if rows else []
+
+
+def _curves(sides: Sequence[Side], target: float | None = None) -> list[Section]:
+    """Return a section on success against every cost; [] if there are no runs."""
+    if not sides:
+        return []
+    note = "Validation success by round of each run. Seconds are of collecting and fitting, without validating."
+    return [Section("Success against cost", figures=curve_figures(sides, target), notes=(note,))]
+
+
+def _films(films: Sequence[Film], no_films: str) -> list[Section]:
     """Return a section with the films, or with the reason if there are none."""
     if not films and not no_films:
         return []
     return [Section("How it looks", (f"No films: {no_films}",) if no_films else (), films=tuple(films))]
-
-
-def _spaced(phase: str) -> str:
-    return phase.replace("_", " ")

@@ -10,7 +10,6 @@ from dataclasses import replace
 import av
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from manip_il.collect.edits import render_states
 from manip_il.collect.job import RolloutJob
@@ -36,12 +35,12 @@ def run_states(job: RolloutJob, seed: int) -> Episode:
 
 
 def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str = "") -> Film:
-    """Return a film of an episode, with its last frame as poster. Raises `RenderError` without off-screen OpenGL."""
+    """Return a film of an episode. Raises `RenderError` without off-screen OpenGL."""
     states = episode.columns[schema.SIM_STATE][::FILM_EVERY]
     camera = next(iter(STOCK[env.robot].cameras if env.robot in STOCK else ()), "front")
     pictures = render_states(env, CameraConfig((camera,), *_SIZE, FILM), states)
     frames = list(pictures[schema.IMAGES + camera])
-    return Film(title, encode_mp4(frames, env.control_hz // FILM_EVERY or 1), caption, encode_jpeg(frames[-1]))
+    return Film(title, encode_mp4(frames, env.control_hz // FILM_EVERY or 1), caption)
 
 
 def collect_films(made: Iterable[Film], progress: Progress) -> tuple[list[Film], str]:
@@ -95,11 +94,4 @@ def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: float) -> bytes:
         for picture in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
         container.mux(stream.encode())
-    return buffer.getvalue()
-
-
-def encode_jpeg(picture: NDArray[np.uint8]) -> bytes:
-    """Return one picture (height, width, 3) as the bytes of a JPEG file."""
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="jpeg", optimize=True, quality=85)
     return buffer.getvalue()

@@ -18,15 +18,11 @@ from manip_il.evaluation.tables import Table
 
 @dataclass(frozen=True)
 class Film:
-    """One episode as an MP4 (H.264), or a picture alone. title: in bold before the caption.
-
-    poster: a JPEG, shown until the film plays.
-    """
+    """One episode as an MP4 (H.264). title: in bold before the caption."""
 
     title: str
-    mp4: bytes = b""
+    mp4: bytes
     caption: str = ""
-    poster: bytes = b""
 
 
 @dataclass(frozen=True)

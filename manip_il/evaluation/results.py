@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from itertools import chain
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
@@ -47,20 +46,12 @@ class EpisodeResult:
     @property
     def condition(self) -> str:
         """The condition's name; empty if there is none."""
-        name = self.detail.get("condition")
-        return name if isinstance(name, str) else ""
-
-    @property
-    def start(self) -> list[float] | None:
-        """Start position of the object, or of the hand if the task has none: x, y, z [m]; None if unknown."""
-        found = self.detail.get("start", {})
-        return found.get("object", found.get("hand"))
+        return self.detail.get("condition", "")
 
     def to_json(self) -> dict[str, Any]:
         """Return the episode as stored in `eval.json`."""
         values = (self.seed, self.success, self.success_at_end, self.steps, self.ret, self.phase_at_end)
-        detail = {key: value for key, value in self.detail.items() if key not in _KEYS}
-        return dict(zip(_KEYS, values, strict=True)) | detail
+        return dict(zip(_KEYS, values, strict=True)) | dict(self.detail)
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
@@ -69,10 +60,9 @@ class EpisodeResult:
         Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or invalid.
         """
         values: list[Any] = [convert(data[key]) for key, convert in _KEYS.items()]
-        for name in ("drawn", "start", "end"):
-            checks.mapping(name, data.get(name, {}))
-        for number in chain(*data.get("start", {}).values(), [data.get("steps_to_success") or 0]):
-            checks.number("start or steps_to_success", number)
+        checks.text("condition", data.get("condition", ""))
+        checks.mapping("drawn", data.get("drawn", {}))
+        checks.number("steps_to_success", data.get("steps_to_success") or 0)
         return cls(*values, detail={key: value for key, value in data.items() if key not in _KEYS})
 
 
@@ -87,7 +77,7 @@ class EvalSettings:
 
     horizon: int
     tolerance: float
-    control_hz: int = 20  # this and the following have defaults for older files, which lack them
+    control_hz: int = 20
     success_steps: int = 5
     suite: str = NOMINAL.name
     conditions: tuple[Condition, ...] = (NOMINAL,)
@@ -108,11 +98,6 @@ class EvalSettings:
         steps, hz = env.success_steps, env.control_hz
         return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, stored(env.object))
 
-    def env(self, robot: NameOrPath, task: NameOrPath, shape: NameOrPath | None = None) -> EnvConfig:
-        """Return the environment of the evaluation. shape: the object, if it is a mesh, as in `EnvConfig`."""
-        limits = self.tolerance, self.success_steps, self.horizon
-        return complete(EnvConfig(self.control_hz, *limits, robot, task, shape or self.object))
-
     @property
     def disturbance(self) -> str:
         """The conditions in words, `none` if all are nominal."""
@@ -126,9 +111,9 @@ class EvalSettings:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
         """Return the inverse of `to_json`; raises what `EpisodeResult.from_json` does. Other keys are ignored."""
-        known = {field.name: data[field.name] for field in fields(cls) if field.name in data}
-        named = [dict(one) for one in known.pop("conditions", [NOMINAL.to_json()])]
-        return cls(**known, conditions=tuple(Condition(**one) for one in named))
+        values = {field.name: data[field.name] for field in fields(cls)}
+        values["conditions"] = tuple(Condition(**one) for one in values["conditions"])
+        return cls(**values)
 
 
 @dataclass(frozen=True)
@@ -159,6 +144,16 @@ class EvalResult:
                 f"evaluation of {self.policy}: {len(self.episodes)} episodes on {len(seeds)} seeds; "
                 "every episode needs its own seed; give each part another --eval.first"
             )
+
+    def env(
+        self, robot: NameOrPath | None = None, task: NameOrPath | None = None, shape: NameOrPath | None = None
+    ) -> EnvConfig:
+        """Return the environment of the evaluation.
+
+        robot, task, shape: the user's own files, because results hold only the names of these.
+        """
+        of, limits = self.settings, (self.settings.tolerance, self.settings.success_steps, self.settings.horizon)
+        return complete(EnvConfig(of.control_hz, *limits, robot or self.robot, task or self.task, shape or of.object))
 
     @property
     def success(self) -> Proportion:

@@ -14,12 +14,11 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.errors import UsageError
 from manip_il.evaluation.figures import INK, Figure, drawing, to_figure
-from manip_il.evaluation.film import encode_jpeg
-from manip_il.evaluation.report import Film, Report, Section
+from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.evaluation.suites import read_condition
-from manip_il.evaluation.tables import CLONING, EXPERT, Table
+from manip_il.evaluation.tables import CLONING, EXPERT, INTERVAL, Table
 from manip_il.option import NameOrPath
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
@@ -40,6 +39,7 @@ STARTS = 50  # number of starts drawn per task
 ENOUGH = 0.95  # share of the workspace that a suitable robot reaches
 LOW = 0.03  # height of objects on the table [m]
 _ROOM = 0.13  # margin of the map around the workspace [m]
+_VIEW = (4.4, 3.5)  # size of a picture of the arm [inches]
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 
 
@@ -145,21 +145,21 @@ def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
 
 
 def check_report(
-    check: RobotCheck, pictures: Sequence[Film], no_pictures: str, command: str, config: Mapping[str, Any]
+    check: RobotCheck, pictures: Sequence[Figure], no_pictures: str, command: str, config: Mapping[str, Any]
 ) -> Report:
     """Return the HTML report of a check. no_pictures: why there are no pictures, or empty."""
     lead = () if pictures else (f"No pictures: {no_pictures}",)
     tasks = (
         f"Starts: how many of {STARTS} were drawn before one found no place within reach. Random actions: a tenth of "
-        "the actions, the gripper's included. Intervals are Wilson's score intervals."
+        "the actions, the gripper's included."
     )
     home = (
         "Axes of ee: x red, y (along the fingers' motion) green, z (out of the hand) blue. "
         f"The gripper opens to {1000 * check.opening:.1f} mm."
     )
     reach = (
-        f"Pointing down, the hand reaches {100 * check.table:.0f} % of the workspace on the table (the frame). Points "
-        "that it reaches are green."
+        "Pointing down, the hand reaches "
+        f"{100 * check.table:.0f} % of the workspace on the table (the frame). Points that it reaches are green."
     )
     return Report(
         title=f"{check.robot.name}: robot check",
@@ -169,7 +169,7 @@ def check_report(
         config=config,
         sections=(
             Section("Tasks", tables=(task_table(check),), notes=(tasks,)),
-            Section("At home in its scene", lead, films=tuple(pictures), notes=(home,)),
+            Section("At home in its scene", lead, figures=tuple(pictures), notes=(home,)),
             Section("Where it reaches", figures=(_reach_figure(check.robot),), notes=(reach,)),
         ),
     )
@@ -180,13 +180,13 @@ def verdict(check: RobotCheck) -> str:
     count, cannot = len(check.tasks), ", ".join(task.name for task in check.failed)
     asked = any(task.clean is not None for task in check.tasks)
     can, end = ("can do", "") if asked else ("has starts for", "; the expert was not run")
-    words = f"{check.robot.name} {can} {count - len(check.failed)} of {count} task{'s' if count > 1 else ''}{end}"
+    words = f"{check.robot.name} {can} {count - len(check.failed)} of {count} tasks{end}"
     return f"{words}; it cannot do {cannot}." if cannot else f"{words}."
 
 
 def task_table(check: RobotCheck) -> Table:
     """Return the table of tasks: starts, and the expert's success without and with random actions."""
-    columns = ("task", "starts", "expert [95 % interval]", "with random actions")
+    columns = ("task", "starts", f"expert {INTERVAL}", "with random actions")
     rows: list[tuple[str, ...]] = []
     for task in check.tasks:
         tests = (str(one.success) if one else "" for one in (task.clean, task.noisy))
@@ -250,8 +250,8 @@ def _at_home(scene: Scene) -> mujoco.MjData:
     return data
 
 
-def looks(name: NameOrPath) -> tuple[Film, ...]:
-    """Return pictures of a robot in its home pose, with the axes of its frame `ee`.
+def looks(name: NameOrPath) -> Figure:
+    """Draw a robot in its home pose, with the axes of its frame `ee`: from outside, and what two cameras see.
 
     Raises `RenderError` without off-screen OpenGL.
     """
@@ -264,12 +264,11 @@ def looks(name: NameOrPath) -> tuple[Film, ...]:
     outside = mujoco.MjvCamera()
     outside.lookat[:], outside.azimuth, outside.elevation = (low + high) / 2, 55.0, -20.0
     outside.distance = 0.6 * float(np.linalg.norm(high - low)) / math.sin(math.radians(22.5))
-    views: tuple[tuple[str | mujoco.MjvCamera, str], ...] = (
-        (outside, "from outside"),
-        ("front", "what camera front sees"),
-        ("wrist", "what camera wrist sees"),
-    )
     data.mocap_pos[:, 2] = -9.0  # move goals out of sight
-    return tuple(
-        Film(words, poster=encode_jpeg(framed_picture(scene, data, view, (480, 640), FILM))) for view, words in views
-    )
+    views = {"from outside": outside, "what camera front sees": "front", "what camera wrist sees": "wrist"}
+    with drawing(len(views), size=_VIEW) as (drawn, axes):
+        for axis, (words, view) in zip(axes[0], views.items(), strict=True):
+            axis.imshow(framed_picture(scene, data, view, (480, 640), FILM))
+            axis.set_title(words)
+            axis.axis("off")
+        return to_figure(drawn, "The arm at home in its scene")

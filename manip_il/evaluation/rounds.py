@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -29,6 +29,11 @@ class Round:
     seconds: float
     validation: Proportion
     unit: Literal["round", "iteration"] = "round"
+
+    @property
+    def folder(self) -> str:
+        """Its folder in the run, which has the `eval.json` of its validation."""
+        return f"validation/{self.round:06d}" if self.unit == "iteration" else f"round_{self.round:03d}"
 
     def amount(self, cost: Cost) -> float:
         """Return the labels, episodes, steps or seconds that the run had used by the end of this round."""
@@ -68,9 +73,11 @@ def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
     return tuple(rounds)
 
 
-def has_unlabelled_steps(rounds: History) -> bool:
-    """Return whether some steps were simulated without a label, so that steps are a separate cost."""
-    return any(one.steps != one.labels for one in rounds)
+def costs_of(histories: Iterable[History]) -> list[Cost]:
+    """Return the costs that runs had: labels only if there are any, steps only if some of them have no label."""
+    rounds = [one for rounds in histories for one in rounds]
+    absent = {"labels": not any(one.labels for one in rounds), "steps": all(one.steps == one.labels for one in rounds)}
+    return [cost for cost in COSTS if not absent.get(cost)]
 
 
 @dataclass(frozen=True)
@@ -118,16 +125,6 @@ class Rule:
         return f"{words} among those within {format_amount(self.at, self.limit)}, which every run reached."
 
 
-def format_seconds(seconds: float) -> str:
-    """Return a duration as `4.2 s`, `3 min 20 s` or `1 h 05 min`."""
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest:02d} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
-
-
 def format_amount(cost: Cost, amount: float) -> str:
-    """Return `8,012 labels`, `150 episodes`, `8,012 steps` or `3 min 20 s`."""
-    return format_seconds(amount) if cost == "seconds" else f"{amount:,.0f} {cost}"
+    """Return `8,012 labels`, `150 episodes`, `8,012 steps` or `200 seconds`."""
+    return f"{amount:,.0f} {cost}"

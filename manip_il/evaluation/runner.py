@@ -217,12 +217,12 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
 
 def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]:
     """Return the differences between two runs of one episode. Raises `MismatchError` if their conditions differ."""
-    now = dict(after.detail["drawn"])
-    if before.detail.get("drawn", {}) != now:
-        raise MismatchError("what is drawn for the episode", "the file", before.detail.get("drawn"), "the replay", now)
-    pairs = {name: (getattr(before, name), getattr(after, name)) for name in ("success", "success_at_end", "steps")}
-    pairs |= {"return": (before.ret, after.ret)}
-    return [f"{name} was {was}, is {value}" for name, (was, value) in pairs.items() if was != value]
+    was, now = before.to_json(), after.to_json()
+    drawn = was.get("drawn", {})
+    if drawn != now["drawn"]:
+        raise MismatchError("what is drawn for the episode", "the file", drawn, "the replay", now["drawn"])
+    compared = ("success", "success_at_end", "steps", "return")
+    return [f"{name} was {was[name]}, is {now[name]}" for name in compared if was[name] != now[name]]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from manip_il.evaluation.figures import ARMS, CLONING, DAGGER, SOFT, Figure, drawing, to_figure
+from manip_il.evaluation.figures import CLONING, COLOURS, DAGGER, SOFT, Figure, drawing, to_figure
 from manip_il.evaluation.intervals import format_percent
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
@@ -174,7 +174,7 @@ def _linear_figure(drifts: Sequence[Drift]) -> Figure:
         for drift in drifts:
             words = f"{OPEN_LOOPS[drift.pole]}, open loop {drift.pole:g}"
             label = words + (", noisy demonstrations" if drift.noise else "")
-            look = {"color": ARMS[poles.index(drift.pole)], "ls": "--" if drift.noise else "-"}
+            look = {"color": COLOURS[poles.index(drift.pole)], "ls": "--" if drift.noise else "-"}
             axis.plot(range(1, len(drift.apart) + 1), np.maximum(drift.apart, _LEAST), lw=1.6, label=label, **look)
         axis.axhline(GUST, color=SOFT, lw=0.8, ls=":")
         axis.set(yscale="log", xlabel="step", ylabel="distance from the expert", ylim=(_LEAST, 100))
@@ -225,7 +225,7 @@ def _clouds_figure(rounds: Sequence[RoundShift]) -> Figure:
     """Positions of the hand in the data and in the policy's rollouts, from above and from the side, by round."""
     if len(rounds) > _CLOUDS:  # mostly early rounds, which differ most
         rounds = [rounds[index] for index in (0, 1, 2, (len(rounds) + 2) // 2, len(rounds) - 1)]
-    with drawing(len(rounds), 2, size=(9.0 / len(rounds), 2.2), share=True) as (drawn, axes):
+    with drawing(len(rounds), 2, size=(9.0 / len(rounds), 2.2), sharex="row", sharey="row") as (drawn, axes):
         for column, one in enumerate(rounds):
             for row, across in enumerate(((1, 0), (0, 2))):
                 axis = axes[row, column]

@@ -96,15 +96,6 @@ def test_finished_runs_and_evaluations_are_not_made_again(here, runs, evaluated)
     assert evaluated[4:] == ["s/cloning/seed_2", "s/dagger/seed_2"]
 
 
-def test_a_study_goes_on_with_its_own_file_alone(here, runs, capsys, error):
-    assert study() == 0
-    (here / "x.yaml").write_text(FILE.replace("rounds: 2", "rounds: 3"))
-    capsys.readouterr()
-    assert study("--resume=true") == 1
-    assert "--common differs: s/config.yaml has" in error()
-    assert len(runs) == 4
-
-
 @pytest.mark.parametrize(
     ("before", "after", "words"),
     [

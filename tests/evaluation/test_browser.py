@@ -13,21 +13,21 @@ from manip_il.evaluation.eval_report import compare_report, eval_report
 from manip_il.evaluation.report import Report
 
 from .browser import HEIGHT, Opened, chromium, opened
-from .made_evals import far_corner, made_eval, made_pair, small_film
+from .made_evals import made_eval, made_pair, often, seldom, small_film
 
 pytestmark = pytest.mark.slow
 
 RESULT = made_eval("runs/a_policy_with_a_name_that_is_rather_long/round_004/policy/pretrained_model", n=200)
-PAIR = made_pair(far_corner, lambda number, _: number % 37 == 0, seeds=2)
+PAIR = made_pair(often, seldom, seeds=2)
 
 
 def made_report() -> Report:
-    """With conditions, a map, films and settings."""
+    """With conditions, films and settings."""
     films = [small_film(number) for number in range(3)]
     return eval_report(RESULT, "manip-il eval --policy.path=runs/a", {"a": {"b": 1}}, films)
 
 
-REPORTS = {"eval": made_report, "compare": lambda: compare_report(PAIR, "a against b", "manip-il compare a b")}
+REPORTS = {"eval": made_report, "compare": lambda: compare_report(PAIR, "a against b", "manip-il compare a b", {})}
 
 
 @pytest.fixture(scope="module")

@@ -3,40 +3,36 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.evaluation.arm import Arm, Member, require_pair
 from manip_il.evaluation.comparison import Comparison, Study
 from manip_il.evaluation.intervals import PairCounts
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
-from manip_il.evaluation.rounds import Rule, history
+from manip_il.evaluation.side import Member, Side, require_pair
 
-from .test_rounds import records
+from .made_evals import FIRST_SEED, made_side
 
 SETTINGS = EvalSettings(100, 0.02)
 EASY = [True] * 80 + [False] * 20
 HARD = [True] * 50 + [False] * 50
 
 
-def made_member(outcomes: list[bool], seed: int | None = None, name: str = "p", **changes) -> Member:
-    episodes = tuple(EpisodeResult(4_000_000 + i, good, good, 10, 0.0) for i, good in enumerate(outcomes))
-    result = EvalResult(name, "panda", "reach", {"mujoco": "3.11.0"}, episodes, SETTINGS)
-    return Member(Path(name), seed, result=replace(result, **changes))
+def result(outcomes: list[bool], **changes: Any) -> EvalResult:
+    episodes = tuple(EpisodeResult(FIRST_SEED + i, good, good, 10, 0.0) for i, good in enumerate(outcomes))
+    return replace(EvalResult("p", "panda", "reach", {"mujoco": "3.11.0"}, episodes, SETTINGS), **changes)
 
 
-def arm(name: str, *outcomes: list[bool]) -> Arm:
-    return Arm(name, tuple(made_member(one, seed, f"{name}/seed_{seed}") for seed, one in enumerate(outcomes)))
-
-
-def one(name: str, outcomes: list[bool]) -> Arm:
-    return Arm(name, (made_member(outcomes, None, name),))
+def side(name: str, *outcomes: list[bool], **changes: Any) -> Side:
+    results = [result(one, **changes) for one in outcomes]
+    return Side(name, tuple(Member(Path(name), seed, result=one) for seed, one in enumerate(results)))
 
 
 def test_one_policy_against_another_is_the_paired_comparison():
-    comparison, paired = Comparison.of(one("A", HARD), one("B", EASY)), PairCounts.of(zip(HARD, EASY, strict=True))
+    comparison, paired = Comparison(side("A", HARD), side("B", EASY)), PairCounts.of(zip(HARD, EASY, strict=True))
     assert comparison.difference == pytest.approx(0.3)
     assert comparison.interval == paired.interval
     assert comparison.verdict.startswith("B is better than A by 30.0 points [20.")
@@ -44,20 +40,20 @@ def test_one_policy_against_another_is_the_paired_comparison():
 
 
 def test_the_verdict_names_the_better_one_on_either_side_and_no_small_difference():
-    assert Comparison.of(one("A", EASY), one("B", HARD)).verdict.startswith("A is better than B by 30.0 points [20.")
-    verdict = Comparison.of(one("A", HARD), one("B", HARD[:-1] + [True])).verdict
+    assert Comparison(side("A", EASY), side("B", HARD)).verdict.startswith("A is better than B by 30.0 points [20.")
+    verdict = Comparison(side("A", HARD), side("B", HARD[:-1] + [True])).verdict
     assert verdict.startswith("No difference shown between B and A: +1.0 points [")
 
 
 def test_over_training_seeds_the_mean_difference_has_students_interval():
-    better = Comparison.of(arm("A", HARD, HARD, HARD), arm("B", EASY, EASY[1:] + [True], EASY[:-1] + [False]))
+    better = Comparison(side("A", HARD, HARD, HARD), side("B", EASY, EASY[1:] + [True], EASY[:-1] + [False]))
     assert [pair.difference for pair in better.pairs] == pytest.approx([0.3, 0.31 - 0.01, 0.3])
     assert better.significant
     assert "100 paired episodes on each of 3 training seeds, ahead in 3" in better.verdict
 
 
 def test_these_policies_may_differ_where_training_seeds_do_not_show_it():
-    comparison = Comparison.of(arm("A", HARD, HARD), arm("B", EASY, HARD[:-2] + [True, True]))
+    comparison = Comparison(side("A", HARD, HARD), side("B", EASY, HARD[:-2] + [True, True]))
     low, high = comparison.interval
     assert comparison.p_value < 0.001
     assert low < 0 < high
@@ -72,63 +68,55 @@ def test_random_arms_of_one_quality_are_seldom_called_different():
     wrong = 0
     for _ in range(400):
         drawn = rng.random((2, 3, 40)) < difficulty
-        wrong += Comparison.of(*(arm(name, *side.tolist()) for name, side in zip("AB", drawn, strict=True))).significant
+        wrong += Comparison(*(side(name, *one.tolist()) for name, one in zip("AB", drawn, strict=True))).significant
     assert wrong <= 32  # 3 standard deviations above 5 %
 
 
 def test_what_is_not_paired_is_refused():
     with pytest.raises(UsageError, match=r"training seeds differ: A has \[0, 1\], B \[0, 1, 2\]"):
-        require_pair(arm("A", HARD, HARD), arm("B", HARD, HARD, HARD))
+        require_pair(side("A", HARD, HARD), side("B", HARD, HARD, HARD))
     with pytest.raises(ManipError, match=r"test episodes of A and B differ"):
-        Comparison.of(one("A", HARD), one("B", HARD[:50]))
+        Study((side("A", HARD), side("B", HARD[:50])), "A")
     with pytest.raises(MismatchError, match=r"robot differs: A has panda, B has fetch"):
-        Comparison.of(one("A", HARD), Arm("B", (made_member(HARD, robot="fetch"),)))
+        Comparison(side("A", HARD), side("B", HARD, robot="fetch"))
     with pytest.raises(MismatchError, match=r"tolerance differs: A has 0\.02, B has 0\.05"):
-        Comparison.of(one("A", HARD), Arm("B", (made_member(HARD, settings=EvalSettings(100, 0.05)),)))
-
-
-def member(name: str, seed: int, outcomes: list[bool], successes: tuple[float, ...], labels: int = 100) -> Member:
-    run = history(records(successes, labels), name)
-    made = made_member(outcomes, seed, f"runs/s/{name}/seed_{seed}")
-    return replace(made, chosen=Rule().select(run, name), history=run, policy=Path("p"))
+        Comparison(side("A", HARD), side("B", HARD, settings=EvalSettings(100, 0.05)))
 
 
 SLOW, FAST = (0.3, 0.5, 0.9, 0.8), (0.5, 0.9, 0.9, 1.0)
 STUDY = Study(
-    tuple(
-        Arm(name, tuple(member(name, seed, outcomes, successes, labels) for seed in range(2)))
-        for name, outcomes, successes, labels in (
-            ("cloning", HARD, SLOW, 100),
-            ("dagger", EASY, FAST, 100),
-            ("dart", HARD[:-1] + [True], SLOW, 300),
-        )
+    (
+        made_side("cloning", [result(HARD)] * 2, SLOW),
+        made_side("dagger", [result(EASY)] * 2, FAST),
+        made_side("dart", [result(HARD[:-1] + [True])] * 2, SLOW, 300),
     ),
     "cloning",
     target=0.9,
 )
 
 
-def row(study: Study, name: str, which: str = "results_table") -> dict[str, str]:
-    table = getattr(study, which)()
+def row(study: Study, name: str) -> dict[str, str]:
+    table = study.table()
     return next(dict(zip(table.columns, row, strict=True)) for row in table.rows if row[0] == name)
 
 
 def test_the_headline_names_the_best_or_which_of_two_is_better():
     rates = "dagger solves 80.0 % of 100 unseen starts, the mean of 2 training seeds; dart 51.0 %, cloning 50.0 %."
     assert STUDY.verdict == rates
-    two = replace(STUDY, arms=STUDY.arms[:2])
+    two = replace(STUDY, sides=STUDY.sides[:2])
     assert two.verdict == two.comparisons["dagger"].verdict
 
 
-def test_a_row_holds_what_the_arm_had_cost_and_how_it_did():
+def test_a_row_holds_what_the_side_had_cost_and_how_it_did():
     assert row(STUDY, "dagger") == {
-        "arm": "dagger",
+        "side": "dagger",
         "labels": "400",
         "episodes": "12",
-        "wall-clock": "40.0 s",
+        "seconds": "40",
         "validation": "100.0 % (100.0, 100.0)",
         "test": "80.0 % (80.0, 80.0)",
         "test, against cloning": "+30.0 points [+30.0, +30.0], p < 0.001",
+        "labels to 90 %": "200",
     }
     assert row(STUDY, "cloning")["test, against cloning"] == ""
 
@@ -148,7 +136,6 @@ def test_compare_json_holds_every_round_and_what_the_verdict_rests_on():
 
 def test_tasks_are_not_compared():
     study = replace(STUDY, baseline=None)
-    worst = "1 of 3 solve 80 % of their unseen starts; the last, cloning, solves 50.0 %."
-    assert replace(study, target=0.8).verdict == worst
+    assert study.verdict == STUDY.verdict
     assert study.comparisons == {}
-    assert not any("against" in column for column in study.results_table().filled().columns)
+    assert not any("against" in column for column in study.table().filled().columns)

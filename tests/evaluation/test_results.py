@@ -11,6 +11,7 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.intervals import confidence_sequence, wilson_interval
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings, merge_results
+from manip_il.evaluation.side import Side
 from manip_il.sim.conditions import Condition
 
 SETTINGS = EvalSettings(horizon=150, tolerance=0.02)
@@ -71,14 +72,8 @@ def test_an_evaluation_that_stopped_by_its_width_says_so_and_keeps_its_wider_int
     assert EvalResult.from_json(json.loads(json.dumps(stopped.to_json()))) == stopped
 
 
-def test_a_file_from_before_there_were_conditions_is_a_nominal_one():
-    data = json.loads(json.dumps(result([True]).to_json()))
-    data["settings"] = {"horizon": 150, "tolerance": 0.02, "disturbance": "none"}
-    assert EvalResult.from_json(data).settings == SETTINGS
-
-
 def compared(left: EvalResult, right: EvalResult) -> Comparison:
-    return Comparison(left.policy, right.policy, ((left, right),))
+    return Comparison(Side.of(left.policy, left), Side.of(right.policy, right))
 
 
 def test_results_are_compared_on_the_seeds_they_share():
@@ -135,7 +130,7 @@ def test_a_value_of_another_kind_is_refused_in_one_line(wrong, tmp_path: Path):
     data = result([True]).to_json()
     fields = [(data, name) for name in ("policy", "robot", "task", "policy_sha256", "until_width", "fingerprint")]
     fields += [(data["settings"], name) for name in data["settings"]]
-    fields += [(data["episodes"][0], name) for name in ("drawn", "start", "end", "steps_to_success")]
+    fields += [(data["episodes"][0], name) for name in ("drawn", "condition", "steps_to_success")]
     for container, name in fields:
         before = container.get(name)
         container[name] = wrong
@@ -148,11 +143,11 @@ def test_a_value_of_another_kind_is_refused_in_one_line(wrong, tmp_path: Path):
         assert "\n" not in str(caught.value)
 
 
-ABSENT = {"drawn": {}, "start": {}, "end": {}}  # what older files lack
+ABSENT = {"drawn": {}, "condition": ""}  # what not every episode has
 
 
 def fits(name: str, value: object) -> bool:
     """Whether a field may hold one of the wrong values."""
-    text = isinstance(value, str) and name in ("policy", "policy_sha256", "suite")
-    mapping = isinstance(value, dict) and name in ("fingerprint", "drawn", "end")
+    text = isinstance(value, str) and name in ("policy", "policy_sha256", "suite", "condition")
+    mapping = isinstance(value, dict) and name in ("fingerprint", "drawn")
     return text or mapping or (value is None and name in ("hold", "until_width", "steps_to_success"))

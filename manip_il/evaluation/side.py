@@ -1,0 +1,177 @@
+"""A side of a comparison or a row of a report: one policy, or one per training seed, and the rounds of their runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from manip_il.collect.workers import Engine
+from manip_il.data.fingerprint import policy_sha256
+from manip_il.data.json_lines import read_lines
+from manip_il.errors import UsageError
+from manip_il.evaluation.policy_folder import find_policy
+from manip_il.evaluation.results import FILE_NAME, EvalResult, require_equal
+from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
+from manip_il.evaluation.runner import FOLDER, Progress, Trial
+from manip_il.evaluation.tables import DAGGER
+from manip_il.tasks.config import EnvConfig
+
+_SEED_FOLDER = re.compile(r"seed_(\d+)")
+
+
+@dataclass(frozen=True)
+class Member:
+    """One policy of a side: an evaluation, a checkpoint, or a run from which a rule chooses a round.
+
+    policy: its folder; None for an evaluation, and for a run before its round is chosen. result: None until measured.
+    """
+
+    path: Path
+    training_seed: int | None = None
+    history: History = ()
+    policy: Path | None = None
+    chosen: Round | None = None
+    result: EvalResult | None = None
+
+    @property
+    def name(self) -> str:
+        """The path, for tables and errors."""
+        return str(self.path)
+
+    @property
+    def test(self) -> EvalResult:
+        """The evaluation of a member that has been measured."""
+        assert self.result is not None
+        return self.result
+
+    @property
+    def validation(self) -> EvalResult:
+        """The validation of the run's first round, in the environment and conditions of all of them."""
+        return EvalResult.read(self.path / self.history[0].folder)
+
+    def select(self, rule: Rule) -> Member:
+        """Return the member with the policy of the round that `rule` chooses. Raises `UsageError` if there is none."""
+        if not self.history:
+            return self
+        chosen = rule.select(self.history, self.name)
+        folder = self.path / chosen.folder
+        return replace(self, chosen=chosen, policy=find_policy(folder / "policy" if chosen.unit == "round" else folder))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "seed": self.training_seed,
+            "name": self.name,
+            "policy": self.policy and str(self.policy),
+            "chosen": self.chosen and self.chosen.to_json(),
+            **self.test.success.to_json(),
+            "rounds": [one.to_json() for one in self.history],
+        }
+
+
+@dataclass(frozen=True)
+class Side:
+    """One policy, or one per training seed, as reports and comparisons show it.
+
+    labels: number of expert labels that a policy learnt from, if known. disturbed: its evaluation under a disturbance,
+    if any.
+    """
+
+    name: str
+    members: tuple[Member, ...]
+    colour: str = DAGGER
+    labels: int | None = None
+    disturbed: EvalResult | None = None
+
+    @classmethod
+    def of(cls, name: str, result: EvalResult, **more: Any) -> Side:
+        """Return the side of one evaluation. more: other fields."""
+        return cls(name, (Member(Path(name), result=result),), **more)
+
+    @property
+    def results(self) -> tuple[EvalResult, ...]:
+        """The evaluation of each member."""
+        return tuple(member.test for member in self.members)
+
+    @property
+    def policies(self) -> tuple[Path, ...]:
+        """The folders of the policies; empty for evaluations."""
+        return tuple(member.policy for member in self.members if member.policy is not None)
+
+    @property
+    def rate(self) -> float:
+        """Mean success over training seeds."""
+        return fmean(result.success.rate for result in self.results)
+
+    @property
+    def histories(self) -> tuple[History, ...]:
+        """The rounds of each member; empty unless all are runs."""
+        runs = tuple(member.history for member in self.members)
+        return runs if all(runs) else ()
+
+    def measure(self, trial: Trial, folder: Path, engine: Engine, progress: Progress) -> Side:
+        """Return the side with the evaluations of its policies, saved in `folder`."""
+        measured: list[Member] = []
+        for member, policy in zip(self.members, self.policies, strict=True):
+            words = f"{re.sub(r'[^A-Za-z0-9]+', '_', member.name)[-80:]}_{policy_sha256(policy)[:8]}"
+            result = trial.measure(policy, member.name, folder / FOLDER / words, engine, progress)
+            measured.append(replace(member, result=result))
+        return replace(self, members=tuple(measured))
+
+
+def select_rounds(rule: Rule, sides: Sequence[Side]) -> tuple[Rule, tuple[Side, ...]]:
+    """Return the rule with the cost limit that all runs share, and the sides with the rounds that the rule chooses."""
+    rule = rule.limited({member.name: member.history for side in sides for member in side.members})
+    return rule, tuple(replace(side, members=tuple(one.select(rule) for one in side.members)) for side in sides)
+
+
+def read_side(path: Path, name: str = "") -> Side:
+    """Return the side at `path`. Raises a one-line `UsageError` if it cannot be compared."""
+    folders = path.iterdir() if path.is_dir() else ()
+    seeds = {int(match[1]): one for one in folders if (match := _SEED_FOLDER.fullmatch(one.name)) and one.is_dir()}
+    members = [replace(read_member(folder), training_seed=seed) for seed, folder in sorted(seeds.items())]
+    return Side(name or str(path), tuple(members) or (read_member(path),))
+
+
+def read_member(path: Path) -> Member:
+    """Return the policy, run or evaluation at `path`. Raises `UsageError` if there is none."""
+    records = read_lines(path / METRICS_FILE) if path.is_dir() else []
+    if any({"round", "iteration"} & record.keys() for record in records):  # `manip-il train` logs only steps
+        return Member(path, history=history(records, str(path)))
+    if path.is_file() or (path / FILE_NAME).is_file():
+        return Member(path, result=EvalResult.read(path))
+    try:
+        return Member(path, policy=find_policy(path))
+    except UsageError:
+        expected = "an eval.json, a policy, a run of manip-il dagger, or a folder of seed_0, seed_1, ... of these"
+        raise UsageError(f"{path} holds nothing to compare; expected {expected}") from None
+
+
+def require_pair(left: Side, right: Side) -> None:
+    """Raise `UsageError` unless two sides can be compared.
+
+    Both must be evaluations, or both policies to evaluate, with the same training seeds; the seeds of two sides with
+    one policy each may differ.
+    """
+    if len({member.result is None for side in (left, right) for member in side.members}) > 1:
+        raise UsageError(
+            f"{left.name} and {right.name}: only one of them is an evaluation; give two eval.json, or two policies"
+        )
+    ours, theirs = ([member.training_seed for member in side.members] for side in (left, right))
+    if len(ours) != len(theirs) or (len(ours) > 1 and ours != theirs):
+        raise UsageError(f"training seeds differ: {left.name} has {ours}, {right.name} {theirs}; give the same ones")
+
+
+def require_same_env(envs: Mapping[str, EnvConfig]) -> EnvConfig:
+    """Return the environment that all sides or runs share. Raises `MismatchError` for the first difference.
+
+    envs: name of a side or run -> its environment.
+    """
+    (first, env), *others = envs.items()
+    for name, other in others:
+        require_equal(first, env, name, other, *(field.name for field in fields(env)))
+    return env
