@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.data import schema
 from manip_il.data.dataset import Dataset
@@ -22,6 +21,7 @@ from manip_il.errors import ManipError
 from manip_il.evaluation.figures import CLONING, DAGGER, SOFT, Figure, drawing, to_figure
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
+from manip_il.mdp import F64, I64
 from manip_il.rewards.methods import LEVEL, Learnt, prior_interval
 from manip_il.rewards.paths import Demonstration, cheapest_path, plan
 from manip_il.robots.table import get_robot
@@ -32,7 +32,6 @@ from manip_il.tasks.envs import scene_of
 from manip_il.tasks.ladder import AT_GOAL
 from manip_il.tasks.pick_place import OBJECT
 
-F64 = NDArray[np.float64]
 CARRY = "carry"
 _MOVED = 0.004  # distance from the start beyond which an object counts as moving [m]
 FILE_NAME = "reward.json"
@@ -112,7 +111,7 @@ class Inverse:
         return found
 
     @cached_property
-    def replanned(self) -> tuple[tuple[NDArray[np.int64], F64], ...]:
+    def replanned(self) -> tuple[tuple[I64, F64], ...]:
         """Cheapest paths from the demonstrations' starts: nodes (n,) and features (K,) of each."""
         shown = [one.demonstration for one in self.carried]
         return tuple(cheapest_path(one.problem, plan(one.problem, self.weights), one.start) for one in shown)

@@ -20,9 +20,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from manip_il.collect.environments import make_env
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.network import MLPNetwork
+from manip_il.mdp import F32, F64
 from manip_il.tasks.config import EnvConfig
-
-F32, F64 = NDArray[np.float32], NDArray[np.float64]
 
 
 class RobotEpisode:

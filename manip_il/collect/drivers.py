@@ -13,17 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, override
 
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.collect.rollout import Act, Turn
-from manip_il.mdp import Actor
+from manip_il.mdp import F64, Actor
 from manip_il.robots.action_space import ActionSpace
 from manip_il.seeding import rng_for
 
 if TYPE_CHECKING:
     from manip_il.learn.policy import LearnedPolicy
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from manip_il.data.lerobot_layout import OURS, Features
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
-from manip_il.mdp import Episode, State
+from manip_il.mdp import F64, Episode, State
 from manip_il.option import NameOrPath
 from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import EnvConfig, stored_config
@@ -233,13 +233,13 @@ def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -
     return found
 
 
-def _count_changed(before: Columns, after: Columns, scale: NDArray[np.float64]) -> int:
+def _count_changed(before: Columns, after: Columns, scale: F64) -> int:
     gaps = (np.abs(before[schema.ACTION] - after[schema.ACTION]) / scale).max(axis=1)
     same = (before[key].ravel() == after[key].ravel() for key in (schema.LABEL_VALID, schema.EXPERT_PHASE))
     return int((~np.logical_and(*same) | (gaps > NOTICEABLE)).sum())
 
 
-def _leads(source: EditSource, columns: Columns) -> NDArray[np.float64]:
+def _leads(source: EditSource, columns: Columns) -> F64:
     """Return recorded minus expert labels, (T, n): the servos' sag, if `serve --log=` wrote the dataset; else 0."""
     action = columns[schema.ACTION].astype(np.float64)
     if not _is_served(source.dataset.provenance):
@@ -256,9 +256,7 @@ def _is_served(provenance: Mapping[str, Any]) -> bool:
     return provenance.get("driver") == SERVED or any(_is_served(one["provenance"]) for one in merged)
 
 
-def _draw_scenes(
-    env: EnvConfig, scenes: Scenes, chunk: tuple[int, NDArray[np.float64], NDArray[np.float64]]
-) -> list[Episode]:
+def _draw_scenes(env: EnvConfig, scenes: Scenes, chunk: tuple[int, F64, F64]) -> list[Episode]:
     seed, states, leads = chunk
     drawer = _drawer(env, scenes)
     rows = enumerate(zip(states, leads, strict=True))

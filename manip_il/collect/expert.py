@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.errors import ManipError
-from manip_il.mdp import Label, State
+from manip_il.mdp import F64, Label, State
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.rotations import turned_towards
 from manip_il.sim.task import Refusing, Target, objects_in
 from manip_il.sim.world import Scene, World
-
-F64 = NDArray[np.float64]
 
 FALLEN = -0.05  # an object below this height has left the table [m]
 NO_PROGRESS = 0.995  # a step that leaves more than this share of the error makes no progress

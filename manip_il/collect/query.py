@@ -14,15 +14,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.collect.drivers import Setting, expert_actions, generators, policy_actions
 from manip_il.collect.rollout import Environment, Gate, Labeller, Rules, Turn, rollout
 from manip_il.errors import UnknownName, UsageError
-from manip_il.mdp import Actor, State, Transition
+from manip_il.mdp import F64, Actor, State, Transition
 from manip_il.seeding import rng_for
 
-F64 = NDArray[np.float64]
 LabelMode = Literal["per_state", "takeover", "branch", "last"]
 """What the expert returns when it is queried.
 

@@ -10,17 +10,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
 from manip_il.collect.expert import Expert
 from manip_il.errors import ManipError
-from manip_il.mdp import Actor, Label, Observation, State, Transition
+from manip_il.mdp import F64, Actor, Label, Observation, State, Transition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import World
 from manip_il.tasks.stock.envs import StockEnvironment, StockLabeller
 
-F64 = NDArray[np.float64]
 Environment = ManipEnv | StockEnvironment
 Labeller = Expert | StockLabeller
 GROWTH = 0.01  # smallest increase of a task's progress, in [0, 1], that counts

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from manip_il.collect.environments import make_env, make_expert
 from manip_il.collect.query import branch
-from manip_il.mdp import Actor, Label, State, Transition
+from manip_il.mdp import F64, Actor, Label, State, Transition
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig
@@ -27,7 +27,6 @@ from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.stock.aloha.environment import AlohaEnv
 
-F64 = NDArray[np.float64]
 CHUNK = 25  # scenes that one worker draws at a time
 GOALS, OBJECTS, NEAR = 0.8, 0.7, 0.5  # shares: new goals, moved objects, moved objects placed near the hand
 _UNTOUCHED = 0.04  # least distance of an untouched object's centre from the hand [m]

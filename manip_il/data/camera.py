@@ -31,8 +31,8 @@ from manip_il.data.atomic import writing
 from manip_il.data.info import PICTURES, Info, reading
 from manip_il.data.parquet_files import EpisodeTable, count_rows, read_file
 from manip_il.errors import ManipError, UnknownName
+from manip_il.mdp import I64
 
-I64 = NDArray[np.int64]
 Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 
 FORMATS = ("PNG", "JPEG")  # of pictures that are decoded

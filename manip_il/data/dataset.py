@@ -32,6 +32,7 @@ from manip_il.data.parquet_files import (
 )
 from manip_il.data.statistics import Statistics, column_statistics, read_statistics
 from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.mdp import I64
 
 UNKNOWN_TASK = UNKNOWN_ROBOT = "unknown"
 _NUMBERED = (layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
@@ -208,7 +209,7 @@ class Dataset:
         """Return a camera's pictures, not yet decoded. Raises what `Camera.of` raises."""
         return Camera.of(self.root, self.info, self.episodes, self.data_files, key)
 
-    def frames(self, key: str, rows: NDArray[np.int64]) -> NDArray[np.uint8]:
+    def frames(self, key: str, rows: I64) -> NDArray[np.uint8]:
         """Return a camera's decoded pictures, (B, height, width, 3), of these rows, (B,)."""
         return self.camera(key).rows(rows)
 
@@ -223,7 +224,7 @@ class Dataset:
         """Statistics of every episode's pictures, by camera."""
         return read_picture_statistics(self.root, self.cameras)
 
-    def rows_of(self, episode: int) -> NDArray[np.int64]:
+    def rows_of(self, episode: int) -> I64:
         """Return the rows of an episode, (T,). Raises `UsageError` if it does not exist."""
         if not 0 <= episode < self.info.episodes:
             raise UsageError(f"{self.root} has no episode {episode}; it has 0 to {self.info.episodes - 1}")
@@ -242,7 +243,7 @@ class Dataset:
         """The tables in `meta/` that are not LeRobot's, such as texts of subtasks."""
         return [path for path in self.root.glob("meta/*.parquet") if path != self.root / layout.TASKS]
 
-    def texts(self, numbers: NDArray[np.int64]) -> list[str]:
+    def texts(self, numbers: I64) -> list[str]:
         """Return the task text of each `task_index`, (T,). Raises `ManipError` for an index without a text."""
         if missing := set(numbers.tolist()) - self.tasks.keys():
             raise ManipError(f"{self.root}: rows have task {min(missing)}, which {layout.TASKS} lacks")

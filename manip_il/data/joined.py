@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from functools import reduce
 
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import PICTURES
 from manip_il.data.lerobot_layout import Features
 from manip_il.data.statistics import Statistics, pool
+from manip_il.mdp import I64
 
-I64 = NDArray[np.int64]
 _IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}  # from LeRobot, for every camera
 
 

@@ -31,7 +31,7 @@ from manip_il.data.statistics import Statistics, column_statistics, picture_stat
 from manip_il.data.video import CameraFiles
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError
-from manip_il.mdp import Episode
+from manip_il.mdp import I64, Episode
 
 _GROUP_ROWS = 1_000  # frames per row group
 _GROUP_EPISODES = 100  # episodes per row group of meta/episodes
@@ -231,7 +231,7 @@ class TableWriter:
             with suppress(OSError):  # a full disk was already reported
                 files.close()
 
-    def _index_columns(self, tasks: NDArray[np.int64]) -> Columns:
+    def _index_columns(self, tasks: I64) -> Columns:
         frame = np.arange(len(tasks), dtype=np.int64)
         return {
             layout.TIMESTAMP: (frame / self._fps).astype(np.float32),

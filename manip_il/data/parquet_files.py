@@ -25,8 +25,8 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import NUMBERS, Feature, Info, reading
 from manip_il.data.statistics import Statistics
 from manip_il.errors import ManipError
+from manip_il.mdp import F64, I64
 
-I64, F64 = NDArray[np.int64], NDArray[np.float64]
 Column = Any  # numpy array, (T,) or (T, ...); of datasets, all but numbers are Arrow arrays
 
 # LeRobot's columns of `meta/episodes`

@@ -16,9 +16,9 @@ from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import NUMBERS
 from manip_il.doctor.finding import Finding, list_first, of_episodes, warning
-from manip_il.mdp import Actor
+from manip_il.mdp import F64, Actor
 
-F64, Mask = NDArray[np.float64], NDArray[np.bool_]
+Mask = NDArray[np.bool_]
 Rows = dict[int, slice]  # episode -> its rows
 _GRIPPER = re.compile(r"grip|finger|jaw|hand|claw", re.IGNORECASE)
 _STILL = 0.01  # a joint is still if it moves by less than this share of its range within a second

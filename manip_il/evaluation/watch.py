@@ -6,20 +6,17 @@ import socket
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import rerun
-from numpy.typing import NDArray
 
 from manip_il.collect.environments import env_spec
 from manip_il.collect.rollout import Act, Turn
 from manip_il.data import schema
-from manip_il.mdp import Actor, Transition
+from manip_il.mdp import F64, Actor, Transition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import phases
 from manip_il.sim.window import Clock, Window
 from manip_il.tasks.config import EnvConfig
 
-F64 = NDArray[np.float64]
 FRAME = "frame"  # timeline: control steps since the first episode began
 _JPEG_QUALITY = 90
 

@@ -43,6 +43,7 @@ from manip_il.caching import cached_per_thread
 from manip_il.data.schema import GRIPPERS, JOINT_TARGETS, RobotTaskSpec
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET
+from manip_il.mdp import F64
 from manip_il.robots.rotations import rotation_vector
 
 if TYPE_CHECKING:  # importing inverse kinematics takes a second
@@ -111,7 +112,7 @@ class Conversion:
         """Return the indices of the joints in an action of n numbers."""
         return np.delete(np.arange(n), self.grippers)
 
-    def _to_radians(self, joints: NDArray[Any]) -> NDArray[np.float64]:
+    def _to_radians(self, joints: NDArray[Any]) -> F64:
         """Return the joints (..., n - 1) [rad] of actions or states, in double precision."""
         in_degrees = self._robot.lerobot is not None
         return np.radians(joints, dtype=np.float64) if in_degrees else np.asarray(joints, np.float64)

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
+
+from manip_il.mdp import F64, I64
 
 _AT_ONCE = 16  # pictures processed at a time, so that intermediate results stay in the cache
 _GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue: ITU-R BT.601
@@ -32,12 +33,12 @@ class Order:
     step, so there is no state to save.
     """
 
-    def __init__(self, rows: int, weights: NDArray[np.float64] | None, batch_size: int, seed: int) -> None:
+    def __init__(self, rows: int, weights: F64 | None, batch_size: int, seed: int) -> None:
         self.rows, self.batch_size, self.seed = rows, batch_size, seed
         self._edges = None if weights is None else np.cumsum(weights) / weights.sum()
         self._epoch, self._order = -1, np.empty(0, np.int64)
 
-    def batch(self, step: int) -> NDArray[np.int64]:
+    def batch(self, step: int) -> I64:
         """Return the row numbers of the batch at `step`, (batch_size,)."""
         if self._edges is not None:
             draws = np.random.default_rng([self.seed, step]).uniform(size=self.batch_size)
@@ -46,7 +47,7 @@ class Order:
         epochs = [(epoch, epoch * self.rows) for epoch in range(start // self.rows, -(-end // self.rows))]
         return np.concatenate([self._permutation(e)[max(start - first, 0) : end - first] for e, first in epochs])
 
-    def _permutation(self, epoch: int) -> NDArray[np.int64]:
+    def _permutation(self, epoch: int) -> I64:
         if epoch != self._epoch:
             order = torch.randperm(self.rows, generator=generator_of(self.seed, epoch))
             self._epoch, self._order = epoch, order.numpy()

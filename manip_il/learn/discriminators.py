@@ -19,13 +19,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from manip_il.learn.adversarial_config import DiscriminatorConfig
 from manip_il.learn.network import MLPNetwork, perceptron
 from manip_il.learn.transitions import F32, Transitions
+from manip_il.mdp import I64
 
 LARGEST_REWARD = 10.0
 Batch = tuple[Tensor, Tensor, Tensor, Tensor]  # states (B, e), actions (B, n), next states (B, e), log pi (B,)
@@ -123,6 +123,6 @@ class Discriminator(nn.Module):
 
 
 def _drawn(data: Batch, count: int, rng: np.random.Generator) -> Batch:
-    rows: NDArray[np.int64] = rng.integers(len(data[0]), size=count)
+    rows: I64 = rng.integers(len(data[0]), size=count)
     index = torch.from_numpy(rows)
     return data[0][index], data[1][index], data[2][index], data[3][index]

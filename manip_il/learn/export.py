@@ -26,6 +26,7 @@ from manip_il.learn.batches import to_float
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
+from manip_il.mdp import F64
 
 TOLERANCE = 1e-5  # largest difference between the actions of the file and of the checkpoint [rad] or [m]
 SERVO_TOLERANCE = 1e-3  # largest difference for robots in servos' units [degrees]
@@ -162,7 +163,7 @@ def _observations(policy: LearnedPolicy, function: PolicyFunction, rows: int) ->
     return dict(zip(function.numbers, parts, strict=True)) | pictures
 
 
-def _actions(policy: LearnedPolicy, function: PolicyFunction, observation: Arrays) -> NDArray[np.float64]:
+def _actions(policy: LearnedPolicy, function: PolicyFunction, observation: Arrays) -> F64:
     """Return the checkpoint's actions, (B, n)."""
     images = {key.removeprefix(IMAGES): observation[key] for key in function.cameras}
     around = observation.get(ENVIRONMENT_STATE, np.empty((len(observation[STATE]), 0), np.float32))

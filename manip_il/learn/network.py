@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -24,6 +23,7 @@ from manip_il.learn.action_spaces import LAST
 from manip_il.learn.checkpoint import MOST_VALUES, WEIGHTS, in_one_line
 from manip_il.learn.losses import LOSSES, make_head
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
+from manip_il.mdp import F32, F64
 from manip_il.option import check_bounds, option
 
 # The order of summation in a matrix product depends on the number of rows. Acting always
@@ -87,7 +87,7 @@ class Shape:
 Statistics = Mapping[str, Tensor]  # named as the buffers of `MLPNetwork`
 
 
-def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], loss: str) -> Statistics:
+def fit_statistics(inputs: F32, targets: F32, loss: str) -> Statistics:
     """Return statistics of inputs (N, d) and targets (N, n), in raw units ([rad], [m]), as float32 vectors.
 
     The network maps x = (input - input_mean) * input_scale to y, and target = target_mean + target_scale * y is
@@ -109,7 +109,7 @@ def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], lo
     return {name: torch.from_numpy(values.astype(np.float32)) for name, values in found.items()}
 
 
-def _mean_and_deviation(values: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _mean_and_deviation(values: F32) -> tuple[F64, F64]:
     """Return mean and standard deviation of each column."""
     mean = values.mean(0, dtype=np.float64)
     return mean, np.sqrt(np.square(values - mean).mean(0))

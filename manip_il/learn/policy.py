@@ -17,7 +17,7 @@ from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import CONFIG, Checkpoint, in_one_line
 from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
 from manip_il.learn.network import MLPNetwork, Shape, read_weights, threads
-from manip_il.mdp import F32, F64, Images
+from manip_il.mdp import F32, F64, I64, Images
 
 if TYPE_CHECKING:  # `episode_policy` imports LeRobot, which takes seconds
     from manip_il.learn.episode_policy import EpisodePolicy
@@ -113,7 +113,7 @@ class LearnedPolicy:
         return batch
 
 
-def actions_along(policy: LearnedPolicy, table: Mapping[str, NDArray[Any]]) -> Iterator[tuple[NDArray[np.int64], F64]]:
+def actions_along(policy: LearnedPolicy, table: Mapping[str, NDArray[Any]]) -> Iterator[tuple[I64, F64]]:
     """Yield row numbers (B,) and a policy's actions (B, n) for each time step of whole recorded episodes.
 
     table: columns `observation.state`, `observation.environment_state` and `episode_index`, one episode after another.

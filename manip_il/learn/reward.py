@@ -22,7 +22,6 @@ from typing import Any, override
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -32,9 +31,9 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.batches import generator_of
 from manip_il.learn.checkpoint import CONFIG, META_FILE, WEIGHTS, Origin, in_one_line, read_config, read_origin
 from manip_il.learn.network import read_weights, threads
+from manip_il.mdp import F32, F64, I64
 from manip_il.option import bounded, check_bounds
 
-F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
 PREFERENCE = "preference"  # type of a learnt reward in config.json
 _KINDS = {STATE: "STATE", ENVIRONMENT_STATE: "ENV", ACTION: "ACTION"}  # LeRobot's types of the inputs
 _ROWS = 16_384  # rows evaluated at a time
@@ -333,7 +332,7 @@ def answer_losses(logits: Tensor, better: Tensor) -> Tensor:
     return nn.functional.binary_cross_entropy(p, better.expand_as(p), reduction="none")
 
 
-def _logits(network: RewardNetwork, inputs: Tensor, compared: Compared, rows: NDArray[np.int64] | slice) -> Tensor:
+def _logits(network: RewardNetwork, inputs: Tensor, compared: Compared, rows: I64 | slice) -> Tensor:
     """Return R(left) - R(right) for every network, (M, A)."""
     both = [torch.from_numpy(side[rows]) for side in (compared.left, compared.right)]
     returns = [network.members(inputs[side.reshape(-1)]).view(-1, *side.shape).sum(-1) for side in both]

@@ -25,9 +25,8 @@ from manip_il.data.schema import ACTION, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.checkpoint import in_one_line
-from manip_il.mdp import require_finite
+from manip_il.mdp import F64, I64, require_finite
 
-I64 = NDArray[np.int64]
 Table = Mapping[str, NDArray[Any]]
 Batch = dict[str, Any]  # as from LeRobot's DataLoader: tensors, and `task` as a list of strings
 TASK = "task"
@@ -189,7 +188,7 @@ def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I6
     return np.flatnonzero(~mask), np.flatnonzero(mask)
 
 
-def rabc_weights(path: Path, episodes: I64, ahead: int) -> NDArray[np.float64]:
+def rabc_weights(path: Path, episodes: I64, ahead: int) -> F64:
     """Return the weight of every frame, (N,), at most 1, from a file with the progress of every frame.
 
     The weights are those of LeRobot's RA-BC (Chen et al. 2025, arXiv:2509.25358, equations 8 and 9). LeRobot

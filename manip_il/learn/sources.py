@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.info import Info
@@ -19,8 +18,7 @@ from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import MLP
-
-F64, I64 = NDArray[np.float64], NDArray[np.int64]
+from manip_il.mdp import F64, I64
 
 
 def row_weights(datasets: Sequence[Dataset], shares: Sequence[float], rows: I64) -> F64:

@@ -15,7 +15,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from accelerate import Accelerator
 from accelerate.state import AcceleratorState
@@ -27,7 +26,6 @@ from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.scripts.lerobot_train import update_policy
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from lerobot.utils.random_utils import set_seed
-from numpy.typing import NDArray
 
 from manip_il.data.dataset import Dataset
 from manip_il.data.joined import JoinedDatasets
@@ -52,6 +50,7 @@ from manip_il.learn.training_state import (
     read_step,
     write_own_files,
 )
+from manip_il.mdp import F64
 
 _METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")  # metrics that LeRobot's `update_policy` sets
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
@@ -78,7 +77,7 @@ class Trainer:
         shares: Sequence[float] = (),
         resume: bool = False,
         on_frames: Callable[[int], None] | None = None,
-        weights: NDArray[np.float64] | None = None,
+        weights: F64 | None = None,
     ):
         first, spec = datasets[0], datasets[0].spec
         roots, specs = [one.root for one in datasets], [one.spec for one in datasets]

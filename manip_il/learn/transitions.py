@@ -29,9 +29,7 @@ from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ACTION, ACTOR, ENVIRONMENT_STATE, LABEL_VALID, STATE, SUCCESS
 from manip_il.errors import NothingToLearnError, UsageError
 from manip_il.learn.samples import Table
-from manip_il.mdp import Actor, require_finite
-
-F32 = NDArray[np.float32]
+from manip_il.mdp import F32, Actor, require_finite
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data.foxglove import NANOSECONDS, frame_times
@@ -22,8 +21,8 @@ from manip_il.errors import ManipError, MismatchError, nearest
 from manip_il.mcap.mapping import TASK, TEXT, Mapping, TopicSource
 from manip_il.mcap.path import values_at
 from manip_il.mcap.read import read_messages, read_pictures, read_topics
+from manip_il.mdp import I64
 
-I64 = NDArray[np.int64]
 Frame = dict[str, Any]  # column -> array or text, and `task`
 
 

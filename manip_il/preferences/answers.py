@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit
 
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.mdp import F64, I64
 from manip_il.preferences.pairs import Clips, Pairs, read_file
 
 FILE_NAME = "preferences.json"
@@ -82,8 +82,8 @@ class Answers:
     skipped: number of `skip` answers. contradictory: number of pairs with both a left and a right answer.
     """
 
-    pair: NDArray[np.int64]
-    better: NDArray[np.float64]
+    pair: I64
+    better: F64
     skipped: int
     contradictory: int
 

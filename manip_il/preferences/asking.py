@@ -9,14 +9,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from manip_il.collect.edits import EditSource, open_source, render_states
 from manip_il.data import schema
 from manip_il.evaluation.film import encode_mp4
+from manip_il.mdp import F64
 from manip_il.preferences.answers import FORMAT, VERSION
 from manip_il.preferences.pairs import Clips, Pairs
 from manip_il.sim.config import FILM, CameraConfig
@@ -71,7 +70,7 @@ def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
     )
 
 
-def _film(source: EditSource, states: NDArray[np.float64], fps: float) -> bytes:
+def _film(source: EditSource, states: F64, fps: float) -> bytes:
     camera = next(iter(STOCK[source.env.robot].cameras if source.env.robot in STOCK else ()), _CAMERA)
     pictures = render_states(source.env, CameraConfig((camera,), SIDE, SIDE, FILM), states)
     return encode_mp4(list(pictures[schema.IMAGES + camera]), fps)

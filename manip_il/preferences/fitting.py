@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from manip_il.evaluation.intervals import Proportion
 from manip_il.learn.reward import Compared, Fit, RewardShape, fit_reward
+from manip_il.mdp import F64
 from manip_il.preferences.answers import Answers
 from manip_il.preferences.pairs import Clips
 
-F64 = NDArray[np.float64]
 TIE = 0.01  # if the clips' mean progress differs by less, neither is better
 
 

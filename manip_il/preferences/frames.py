@@ -15,9 +15,8 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.learn.sources import check_same_sources
-from manip_il.mdp import require_finite
+from manip_il.mdp import F32, F64, I64, require_finite
 
-F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
 _ROUNDS = "round_*/dataset"  # a run's datasets
 
 

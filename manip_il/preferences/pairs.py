@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit
 
 from manip_il import checks
@@ -18,9 +17,9 @@ from manip_il.data.build import dataset_sha256
 from manip_il.data.fingerprint import canonical_json
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.reward import LearnedReward
+from manip_il.mdp import F32, F64, I64
 from manip_il.preferences.frames import Frames, read_all
 
-F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
 Members = Callable[[F32], F64]  # maps inputs (B, d) to the rewards (M, B) of M networks
 POOL = 10  # candidates per pair when choosing by disagreement
 _TRIES = 100  # attempts to draw a new pair

@@ -25,9 +25,9 @@ from scipy.stats import mannwhitneyu
 from manip_il.data.atomic import writing
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.evaluation.tables import Table
+from manip_il.mdp import F64
 from manip_il.preferences.frames import Frames
 
-F64 = NDArray[np.float64]
 FILE_NAME, WEIGHTS_FILE = "scores.json", "rabc.parquet"
 LAST = 1.0  # an episode's score is the mean over its last second [s]
 BEST, BELOW = 0.75, 0.25  # quantile of the episodes' scores, and how far below it the score of a kept episode may be

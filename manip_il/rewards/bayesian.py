@@ -13,11 +13,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64, I64
 from manip_il.rewards.paths import Demonstration, add_rivals, rivals
 
-F64, I64 = NDArray[np.float64], NDArray[np.int64]
 Density = Callable[[F64], F64]  # log-densities (C,) at points (C, K)
 PRIOR = 300.0  # mean of a weight [1/m]
 TASTES = 60  # weight vectors drawn from the prior, the same for all demonstrations

@@ -18,13 +18,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from manip_il.errors import ManipError
+from manip_il.mdp import F64
 from manip_il.rewards.paths import LENGTH, Demonstration, PathProblem, plan, stages
 
-F64 = NDArray[np.float64]
 PRIOR = 300.0  # standard deviation of a weight [1/m]
 _MOST_STEPS = 200
 _GRADIENT_TOLERANCE, _LOSS_TOLERANCE = 1e-4, 1e-6  # [m] and relative; L-BFGS-B stops below either

@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.rewards.paths import LENGTH, Demonstration, cheapest_path, plan_edges, stages
 
-F64 = NDArray[np.float64]
 MARGIN = 0.05  # margin per metre of path off the demonstration
 RIDGE = 1e-4  # factor of the penalty, half the squared weights
 _STEPS = 50  # subgradient steps in each stage

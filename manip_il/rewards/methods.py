@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.rewards import bayesian, max_entropy, max_margin
 from manip_il.rewards.paths import LENGTH, Demonstration, open_features, rivals
 
-F64 = NDArray[np.float64]
 METHODS = ("max_margin", "bayesian", "max_entropy")
 LEVEL = 0.9  # level of the credible intervals
 _TASTES = 20  # random weight vectors whose paths show whether a feature matters

@@ -12,13 +12,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from manip_il.errors import ManipError
+from manip_il.mdp import F64, I64
 
-F64, I64 = NDArray[np.float64], NDArray[np.int64]
 NOWHERE = -1  # stands for "no next node"
 LENGTH = 0  # feature that every edge has; other weights are given relative to its weight
 _EVERY, _FEW = 5, 5  # the first stage takes every fifth demonstration, if that leaves at least five

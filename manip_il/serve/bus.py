@@ -21,9 +21,9 @@ from lerobot.motors.feetech import tables
 from numpy.typing import ArrayLike, NDArray
 from scservo_sdk import scservo_def as protocol
 
-from manip_il.mdp import F64
+from manip_il.mdp import F64, I64
 
-I64, U8 = NDArray[np.int64], NDArray[np.uint8]
+U8 = NDArray[np.uint8]
 _MODEL = "sts3215"
 _TABLE, _SIGNS = tables.MODEL_CONTROL_TABLE[_MODEL], tables.MODEL_ENCODING_TABLE[_MODEL]
 STEPS: int = tables.MODEL_RESOLUTION[_MODEL]  # encoder steps per turn

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.mdp import Observation, State
+from manip_il.mdp import F32, Observation, State
 from manip_il.robots.robot import Robot
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import Condition, draw
@@ -29,7 +29,6 @@ from manip_il.sim.variation import with_drawn
 from manip_il.sim.window import Window, require_display
 from manip_il.sim.world import SCENES_KEPT, Scene, World
 
-F32 = NDArray[np.float32]
 _JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
 
 

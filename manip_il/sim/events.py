@@ -11,14 +11,13 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import Condition, merged
 from manip_il.sim.task import Task, objects_in
 from manip_il.sim.world import World
 
-F64 = NDArray[np.float64]
 Change = Callable[[World, np.random.Generator], object]
 WrongAction = Callable[[F64, World, np.random.Generator], F64]
 

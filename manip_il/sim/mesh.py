@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.errors import UsageError, shorten
+from manip_il.mdp import F64, I64
 from manip_il.option import NameOrPath
 
 _TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj))(?P<length>:\d*\.?\d+)?", re.DOTALL)
@@ -29,8 +29,8 @@ class Mesh:
 
     stored: str
     sha256: str
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices: F64
+    faces: I64
     volume: float
 
     @property

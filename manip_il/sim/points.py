@@ -7,11 +7,10 @@ from itertools import product
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.sim.world import SCENES_KEPT, Scene, World
 
-F64 = NDArray[np.float64]
 _SIGNS = np.array(list(product((-1, 1), repeat=3)))  # signs of a box's corners
 _NAMED = (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_SITE)
 _CORNERS = 4  # a box's upper corners, which cameras see

@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.seeding import rng_for
 from manip_il.sim.world import GOAL, Scene
 
-F64 = NDArray[np.float64]
 VERSION = 3  # version of the look of these objects, part of the fingerprint of pictures
 _POLE, _SHORTEST = 0.003, 0.03  # radius of a goal's pole, and its least height [m]
 _FOOT, _ARM = 1.2, 1.6  # radius of a goal's foot, half the length of its cross, in radii of the largest object

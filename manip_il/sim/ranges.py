@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import I64
 from manip_il.sim.config import CAMERAS
 
 Range = tuple[float, float]
@@ -58,7 +58,7 @@ class Quantity(NamedTuple):
     changes: str = ""
     of_object: bool = False
     draw: Callable[[np.random.Generator, Range], Any] = _number
-    places: Sequence[int] | NDArray[np.int64] = range(0)
+    places: Sequence[int] | I64 = range(0)
     nominal: float = 0.0
 
     @property

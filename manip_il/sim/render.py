@@ -15,6 +15,7 @@ from PIL import Image
 
 from manip_il.caching import cached_per_thread
 from manip_il.errors import RenderError
+from manip_il.mdp import F32, F64
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.props import Prop, props
 from manip_il.sim.scene import camera_id
@@ -22,7 +23,6 @@ from manip_il.sim.variation import part
 from manip_il.sim.view import ViewModel
 from manip_il.sim.world import Scene
 
-F64 = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1"
 REMEDY = f"unset MUJOCO_GL if it is set; on Debian: apt-get install -y {PACKAGES}"  # if no picture can be rendered
@@ -46,7 +46,7 @@ def pictures(
     return {name: renderer.picture(name, cameras.size) for name in cameras.names}
 
 
-def projections(scene: Scene, cameras: CameraConfig, points: NDArray[np.float64]) -> dict[str, NDArray[np.float32]]:
+def projections(scene: Scene, cameras: CameraConfig, points: F64) -> dict[str, F32]:
     """Return where points (K, 3) of the world [m] are in this thread's last `pictures`: name -> (K, 3).
 
     Columns: position across and down, each from 0 to 1, then 1. All three are 0 for a point outside the picture. A
@@ -151,7 +151,7 @@ class _Renderer:
         mujoco.mjr_readPixels(fine, None, view, self._context)
         return np.asarray(Image.fromarray(fine).reduce(_FINER))[::-1].copy()  # OpenGL counts rows from below
 
-    def project(self, camera: str, points: NDArray[np.float64], aspect: float) -> NDArray[np.float32]:
+    def project(self, camera: str, points: F64, aspect: float) -> F32:
         number = self._cameras[camera]
         x, y, back = self._data.cam_xmat[number].reshape(3, 3).T @ (points - self._data.cam_xpos[number]).T
         ahead = np.where(back < 0, -back, np.inf)

@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from manip_il.mdp import F64
 from manip_il.sim.shape import ROLLING_MESH
 
-F64 = NDArray[np.float64]
 DEEPEST = 0.035  # depth of the ee site below an object's top at which the palm just clears it [m]
 LEAST_HEIGHT = 0.012  # least height of an object on the table: fingers slip over lower ones [m]
 LEAST_ROOM = 0.002  # least clearance of an open gripper around an object [m]

@@ -8,15 +8,14 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.errors import UsageError, shorten
+from manip_il.mdp import F64
 from manip_il.option import NameOrPath
 from manip_il.robots.robot import Robot
 from manip_il.sim.shape import Shape
 from manip_il.sim.world import World
 
-F64 = NDArray[np.float64]
 Observed = Mapping[str, "F64 | float"]
 
 

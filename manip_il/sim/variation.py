@@ -12,13 +12,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64, I64
 from manip_il.sim.config import CAMERAS
 from manip_il.sim.ranges import OWN, RANGES
 from manip_il.sim.shape import Shape, contact
 
-F64 = NDArray[np.float64]
 GEOMS = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -115,7 +114,7 @@ def apply(
     model: Any,
     plain: mujoco.MjModel,
     objects: Mapping[str, Object],
-    motors: NDArray[np.int64],
+    motors: I64,
     variation: F64,
 ) -> None:
     """Apply `variation` (v,) to the objects and the arm of a model that is not shared.

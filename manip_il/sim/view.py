@@ -17,12 +17,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.sim.config import CAMERAS, Look
 from manip_il.sim.scene import TABLE, camera_id
 from manip_il.sim.variation import part, seen_objects
 from manip_il.sim.world import SCENES_KEPT, Scene
 
-F64 = NDArray[np.float64]
 Indices = NDArray[np.integer]
 _CELLS = 22  # grid cells along a mesh's diagonal: enough to look right at 480 x 640 pixels
 _LEAST_CELL = 0.008  # least width of a cell: a pixel at 128 x 128; less if the cameras are nearer [m]

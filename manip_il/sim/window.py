@@ -16,14 +16,13 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.errors import RenderError
+from manip_il.mdp import F64
 from manip_il.sim.config import FILM
 from manip_il.sim.view import ViewModel
 from manip_il.sim.world import STATE_KIND, Scene
 
-F64 = NDArray[np.float64]
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of X11 and Wayland
 _LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION = 0.15, 1.9, 140.0, -25.0  # initial camera: target's height [m], [m], [deg]
 _CLOSING = 5.0  # longest wait for each of the viewer's threads [s]

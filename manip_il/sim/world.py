@@ -14,9 +14,9 @@ from typing import Any, NamedTuple, NoReturn
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.mdp import F64, I64
 from manip_il.robots.action_space import ActionSpace
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.reach import Reach, reach_of
@@ -27,7 +27,6 @@ from manip_il.sim.rests import Hull
 from manip_il.sim.shape import ANY
 from manip_il.sim.variation import Object
 
-F64 = NDArray[np.float64]
 STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _BESIDE, _NEAR = (-0.02, 0.07), 0.08  # heights and distance at which a hand may hit a neighbour of an object [m]
 _MOST_TURNS = 4  # symmetric turns tried in each direction
@@ -60,8 +59,8 @@ class Scene:
     gripper: Gripper
     actions: ActionSpace
     objects: Mapping[str, Object]
-    arm_q: NDArray[np.int64]
-    arm_ctrl: NDArray[np.int64]
+    arm_q: I64
+    arm_ctrl: I64
     ee_site: int
     shoulder: int
     yaws: tuple[float, float]
@@ -85,7 +84,7 @@ class Scene:
         return min(1.0, self.robot.workspace.half_width / USUAL)
 
     @cached_property
-    def furniture(self) -> NDArray[np.int64]:
+    def furniture(self) -> I64:
         """The geoms of mocap bodies: goal markers and the fixed parts of the task."""
         return np.flatnonzero(self.model.body_mocapid[self.model.body_rootid[self.model.geom_bodyid]] >= 0)
 
@@ -276,7 +275,7 @@ class World:
         return [(x, y) for x, y, z in nearest.tolist() if low < z < high and 0 < math.hypot(x, y) < _NEAR]
 
     @cached_property
-    def _standing(self) -> Mapping[str, NDArray[np.int64]]:
+    def _standing(self) -> Mapping[str, I64]:
         """For each object, the geoms of furniture and of the other objects."""
         objects, furniture = self.scene.objects, self.scene.furniture
         furniture = furniture[self.scene.model.geom_contype[furniture] > 0]

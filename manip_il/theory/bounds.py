@@ -17,10 +17,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.seeding import rng_for
 from manip_il.theory.processes import PLACES, Process
 
-F64 = NDArray[np.float64]
 HORIZONS = (10, 20, 40, 80, 160, 320, 640)
 ERROR = 0.03  # mean error of a policy times the horizon, small enough that the gap does not saturate
 DRAWS = 16  # training sets drawn at each horizon

@@ -13,11 +13,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from manip_il.mdp import F64
 from manip_il.seeding import rng_for
 
-F64 = NDArray[np.float64]
 OPEN_LOOPS = {0.8: "stable", 1.0: "marginal", 1.25: "unstable"}  # names of the poles a
 STEPS, DEMONSTRATIONS, ROLLOUTS = 40, 50, 500
 BACK = 0.5  # factor by which the expert shrinks the state in one step

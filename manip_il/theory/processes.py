@@ -12,7 +12,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-F64, I64 = NDArray[np.float64], NDArray[np.int64]
+from manip_il.mdp import F64, I64
+
 PLACES = 100  # states that the expert visits
 RIGHT, WRONG = 0, 1  # the expert's action in every state, and the other one
 _BELOW_1 = 1 - 1e-9  # keeps a random number below 1 after rounding

@@ -26,12 +26,11 @@ from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.learn.policy import LearnedPolicy, actions_along
-from manip_il.mdp import Episode
+from manip_il.mdp import F64, Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.tasks.config import EnvConfig
 
-F64 = NDArray[np.float64]
 EPISODES = 50  # episodes of the expert and of each round's policy
 WRONG = 0.25  # an action is wrong if any joint is off the label by more than this share of its largest step
 MOST_STATES = 4_000  # largest number of training states to compare with

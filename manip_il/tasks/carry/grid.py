@@ -14,13 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.mdp import F64
+from manip_il.mdp import F64, I64
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.tasks.carry.layout import Layout, Reward
 
-I64 = NDArray[np.int64]
 CELL = 0.02  # grid spacing, at full scale [m]
 BEYOND = 0.09  # how far the grid extends beyond the workspace's half width, at full scale [m]
 TOP = 0.32  # height of the grid over the table, at full scale [m]
