@@ -40,7 +40,9 @@ class Agent:
 
     def __init__(self, config: LearningConfig, clock: Stopwatch):
         self.config, self._clock = config, clock
-        self.number, self.simulated, self.validated_at = 0, 0, 0
+        self.number = 0
+        self.simulated = 0
+        self.validated_at = 0
         self.metrics: dict[str, float] = {}
         self._modules: dict[str, Discriminator] = {}
         self._spec = spec = Dataset.open(config.datasets[0]).spec if config.datasets else env_spec(config.env)

@@ -147,7 +147,9 @@ class Inverse:
 
 def weight_table(found: Inverse) -> Table:
     """Return a table of the weights, one row per feature."""
-    learnt, (shown, planned), rows = found.learnt, found.means, []
+    learnt = found.learnt
+    shown, planned = found.means
+    rows = []
     for k, name in enumerate(FEATURES):
         weight, interval = f"{learnt.weights[k]:.2f}", ""
         if k in learnt.open:

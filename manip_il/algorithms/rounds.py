@@ -34,7 +34,10 @@ from manip_il.seeding import stream_base
 
 _LOG = logging.getLogger(__name__)
 CHUNK_STEPS = 20_000  # default gradient steps per round for LeRobot's policies
-DATASET, JOURNALS, POLICY, REDRAWN = "dataset", "journals", "policy", "redrawn"
+DATASET = "dataset"
+JOURNALS = "journals"
+POLICY = "policy"
+REDRAWN = "redrawn"
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,9 @@ from manip_il.sim.events import standard_in
 if TYPE_CHECKING:  # rollouts alone do not need torch and stable-baselines3
     from manip_il.algorithms.agent import Agent
 
-BEST, CHECKPOINTS, HELD_OUT = "best", "checkpoints", "held_out"
+BEST = "best"
+CHECKPOINTS = "checkpoints"
+HELD_OUT = "held_out"
 
 
 class Run:
@@ -75,7 +77,9 @@ class Run:
 
     def __init__(self, config: Any, folder: Path, engine: Engine, watch: Watch | None = None):
         self.config, self.folder = config, folder
-        self._engine, self._watch, self._clock = engine, watch or Watch(), Stopwatch()
+        self._engine = engine
+        self._watch = watch or Watch()
+        self._clock = Stopwatch()
         self._made: dict[int, Rollouts] = {}
         self._held_out_steps = 0
         self._fitted: Fitted | None = None
@@ -145,7 +149,9 @@ class Run:
         query: when the expert is queried; None: in every state. disturbed: share of the episodes that have the
         disturbances `manip_il.sim.events.STANDARD`.
         """
-        here, config, rule = self._folder(round_), self.config, query or Query()
+        here = self._folder(round_)
+        config = self.config
+        rule = query or Query()
         count = config.episodes_per_round
         self._watch.on_stage("collect", round_, count)
         with self._clock.timed("collect"):
@@ -168,7 +174,9 @@ class Run:
 
     def fit(self, data: Sequence[Rollouts]) -> Fitted:
         """Fit the policy, or all members of an ensemble, to `data`, whose last rollouts are of the policy's round."""
-        config, before, round_ = self.config, self._fitted, data[-1].round
+        config = self.config
+        before = self._fitted
+        round_ = data[-1].round
         here, members = self._folder(round_), list[Path]()
         if config.start is not None and (round_ == 0 or all(one.dataset is None for one in data)):
             members.append(begin_with(config.start, here))

@@ -101,7 +101,9 @@ class Unending(gymnasium.Env[F32, Any]):
     """
 
     def __init__(self, episode: Any, space: spaces.Box, horizon: int):
-        self.episode, self.action_space, self._horizon = episode, space, horizon
+        self.episode = episode
+        self.action_space = space
+        self._horizon = horizon
         self._steps = self.simulated = 0
         episode.start(0)
         self._inputs = len(episode.inputs())

@@ -105,7 +105,9 @@ class EvalOptions(Tested, Seeded, Trusting):
         seeds = stream_seeds(self.eval.stream, end, self.seed)[self.eval.first :]
         name, engine = str(self.policy.type or self.policy.path), self.engine.open()
         engine.warm_up(learned=self.policy.path is not None)  # meanwhile this process checks the policy
-        job, suite, width = self._job(), self.suite, self.until_width
+        job = self._job()
+        suite = self.suite
+        width = self.until_width
         with self.output.open(self) as folder:
             finished_episodes(folder, job, suite)  # raises if the folder has another policy's episodes
             with Stages(f"finished episodes, in {folder}") as stages, engine:

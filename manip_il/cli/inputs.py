@@ -123,7 +123,9 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
 
     Raises `MismatchError` unless the policy can drive `env`, `ManipError` if loading it needs `trust`.
     """
-    path, origin, cameras = checkpoint.path, checkpoint.origin, checkpoint.cameras
+    path = checkpoint.path
+    origin = checkpoint.origin
+    cameras = checkpoint.cameras
     spec = env_spec(env, cameras)
     checkpoint.check_fits(spec)
     checkpoint.require_trust(trust)

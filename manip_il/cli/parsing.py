@@ -169,7 +169,9 @@ def _build(cls: Any, values: Mapping[tuple[str, ...], Any], base: Any = None, pa
     """Return an instance of `cls`. values: those given, by path; other fields are as in `base`, else the defaults."""
     arguments: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
-        here, kind, default = (*path, field.name), type_of(cls, field), default_of(field, base)
+        here = (*path, field.name)
+        kind = type_of(cls, field)
+        default = default_of(field, base)
         if "given" in field.metadata:
             raw = {inner[-1]: value for inner, value in values.items() if inner[:-1] == here}
             arguments[field.name] = default | raw

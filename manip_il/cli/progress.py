@@ -87,7 +87,9 @@ class Stages:
     """
 
     def __init__(self, kept: str = ""):
-        self.kept, self._stopping, self._handlers = kept, False, dict[int, Any]()
+        self.kept = kept
+        self._stopping = False
+        self._handlers = dict[int, Any]()
         self._bar: Any = None
         self._solved = 0
 

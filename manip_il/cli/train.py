@@ -69,7 +69,9 @@ class TrainOptions(Seeded, Trusting):
         writes = os.environ.get(RANK, "0") == "0"  # only the first of several processes writes
         if not writes:
             set_quiet(True)
-        config, folder, weights = self.config(), self.output.output_dir, None
+        config = self.config()
+        folder = self.output.output_dir
+        weights = None
         language = config.kind not in PLAIN
         datasets = open_datasets(self.dataset.root, pictures=config.takes_images, language=language)
         options, _ = lerobot_options(config)  # raises what LeRobot would, before anything is written

@@ -220,7 +220,9 @@ def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -
     """
     if env.robot in STOCK and not STOCK[env.robot].cameras:
         raise RenderError(f"{env.robot} has no cameras")
-    view, spec, rows = make_env(env, cameras), env_spec(env, cameras), len(states)
+    view = make_env(env, cameras)
+    spec = env_spec(env, cameras)
+    rows = len(states)
     found: Columns = {key: np.empty((rows, *cameras.size, 3), np.uint8) for key in spec.image_keys}
     found |= {key: np.empty((rows, 3 * len(spec.keypoints)), np.float32) for key in spec.keypoint_keys}
     for row, state in enumerate(states):

@@ -36,7 +36,9 @@ def collect(
     repeatedly kills its worker is left out with a warning. on_episode: called when an episode is on disk; an exception
     in it ends the run, and finished episodes stay on disk.
     """
-    journal, waiting, on_disk = journal_of(journals, job), deque(seeds), set(list_seeds(journals))
+    journal = journal_of(journals, job)
+    waiting = deque(seeds)
+    on_disk = set(list_seeds(journals))
 
     def ready() -> Iterator[tuple[Journal, Episode]]:
         while waiting and waiting[0] in on_disk:

@@ -28,7 +28,10 @@ from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.stock.aloha.environment import AlohaEnv
 
 CHUNK = 25  # scenes that one worker draws at a time
-GOALS, OBJECTS, NEAR = 0.8, 0.7, 0.5  # shares: new goals, moved objects, moved objects placed near the hand
+# shares: new goals, moved objects, moved objects placed near the hand
+GOALS = 0.8
+OBJECTS = 0.7
+NEAR = 0.5
 _UNTOUCHED = 0.04  # least distance of an untouched object's centre from the hand [m]
 _AROUND = 0.04  # standard deviation of an object's place near the hand, in x and y [m]
 _DEEP = 1e-3  # largest overlap of a moved object with another [m]

@@ -77,7 +77,10 @@ class Recording:
         rollouts = iter(rollouts)
         if (first := next(rollouts, None)) is None:
             raise NothingToLearnError("no episode was recorded")
-        about, seeds, failed, found = first[0], list[int](), 0, 0
+        about = first[0]
+        seeds = list[int]()
+        failed = 0
+        found = 0
         provenance = dict(self.provenance)
 
         def selected() -> Iterator[Episode]:

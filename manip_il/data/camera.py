@@ -135,7 +135,9 @@ def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = 
         decoded[start + rows[0] : start + rows[-1] + 1] = camera.rows(rows).transpose(0, 3, 1, 2)
         return len(rows)
 
-    step, start, pieces = max(_PIECE, _PIECE_BYTES // math.prod(shape[1:])), 0, list[tuple[Camera, int, I64]]()
+    step = max(_PIECE, _PIECE_BYTES // math.prod(shape[1:]))
+    start = 0
+    pieces = list[tuple[Camera, int, I64]]()
     for camera in cameras:
         rows = np.split(np.arange(camera.frames), range(step, camera.frames, step))
         pieces += [(camera, start, piece) for piece in rows]

@@ -14,7 +14,10 @@ from manip_il.errors import FolderExistsError, UsageError
 PARTIAL = ".partial"  # suffix of unfinished files and folders
 UNFINISHED_MARK = ".manip_il_unfinished"  # file in the folder around one that is being written
 CONFIG_FILE, CONFIG_HEADER = "config.yaml", "# manip-il"  # options of a command, and how their first line begins
-DATASET, EPISODES, POLICY, CHECKPOINT = "a dataset", "journals", "a policy", "a checkpoint"
+DATASET = "a dataset"
+EPISODES = "journals"
+POLICY = "a policy"
+CHECKPOINT = "a checkpoint"
 UNFINISHED = "an unfinished folder"
 
 _OPTIONS = re.compile(rf"{CONFIG_HEADER} .*\((\w+)\)\n".encode())

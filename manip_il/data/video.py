@@ -51,7 +51,10 @@ class CameraFiles:
     """Writes one camera's numbered video files, one at a time; the same episodes give the same bytes."""
 
     def __init__(self, folder: Path, key: str, config: VideoConfig, fps: float):
-        self._folder, self._key, self._config, self._fps = folder, key, config, exact_rate(fps)
+        self._folder = folder
+        self._key = key
+        self._config = config
+        self._fps = exact_rate(fps)
         self._limit = layout.VIDEO_FILES_SIZE_IN_MB * 2**20
         self._number = self._frames = self._bytes = 0
         self.encodes = False  # whether pictures were written, not only copied
@@ -97,9 +100,14 @@ class CameraFiles:
 
     def close(self) -> None:
         """Finish the open file, if any. Raises `OSError` if it cannot be written."""
-        container, self._container, self._stream = self._container, None, None  # an error on closing is raised once
+        # an error on closing is raised once
+        container = self._container
+        self._container = None
+        self._stream = None
         if container is not None:
-            self._number, self._frames, self._bytes = self._number + 1, 0, 0
+            self._number = self._number + 1
+            self._frames = 0
+            self._bytes = 0
             container.close()
 
     def info(self) -> dict[str, Any]:
@@ -149,7 +157,9 @@ def _cut(source: Path, target: Path, first: int, count: int, fps: float) -> None
             raise ValueError(f"frames {first} to {first + count - 1} cannot be cut out without encoding them again")
         start = packets[0].pts or 0
         for one in packets:
-            one.pts, one.dts, one.stream = (one.pts or 0) - start, (one.dts or 0) - start, own
+            one.pts = (one.pts or 0) - start
+            one.dts = (one.dts or 0) - start
+            one.stream = own
             container.mux_one(one)
 
 

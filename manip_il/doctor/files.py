@@ -61,7 +61,9 @@ def check_info(dataset: Dataset) -> Iterator[Finding]:
 
 def check_rows(dataset: Dataset) -> Iterator[Finding]:
     """Check that episodes are contiguous and numbered from 0, and that rows have matching indices and timestamps."""
-    table, tasks, info = dataset.episodes, dataset.tasks, dataset.info
+    table = dataset.episodes
+    tasks = dataset.tasks
+    info = dataset.info
     ends = np.cumsum(table.length)
     frame = np.concatenate([np.arange(length) for length in table.length])
     columns = {key: dataset.columns([key])[key].reshape(-1) for key in INDEX_FEATURES}
@@ -104,7 +106,9 @@ def check_numbers(dataset: Dataset) -> Iterator[Finding]:
     if stored is None:
         yield warning(layout.STATS, "is missing: LeRobot cannot normalise without it")
     for feature in dataset.info.of_dtype(*NUMBERS, *PICTURES):
-        key, text, table = feature.key, "", (stored or {}).get(feature.key)
+        key = feature.key
+        text = ""
+        table = (stored or {}).get(feature.key)
         if feature.dtype in NUMBERS:
             values = dataset.columns([key])[key].reshape(len(dataset), -1).astype(np.float64, copy=False)
             if len(bad := np.flatnonzero(~np.isfinite(values).all(axis=1))):

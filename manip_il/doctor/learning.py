@@ -25,7 +25,10 @@ _STILL = 0.01  # a joint is still if it moves by less than this share of its ran
 _IDLE, _CLIPPED = 0.1, 0.05  # tolerated shares of the frames
 _LEAD = 0.4  # tolerated lead of actions over the joints that follow them [s]
 _LEAST = 10  # least number of episodes for comparisons between them
-_EPISODES, _PICTURES, _SIDE = 100, 6, 16  # checked episodes, pictures of each, thumbnail size [pixels]
+# checked episodes, pictures of each, thumbnail size [pixels]
+_EPISODES = 100
+_PICTURES = 6
+_SIDE = 16
 _HALF_TURNS = (180.0, np.pi)  # [deg], [rad]
 _SAME, _DARK = 1.5, 10.0  # pixel values, 0 to 255: largest change in an unchanged thumbnail, mean of a black picture
 _AGAIN = "correct the recorder, and record again"

@@ -18,7 +18,9 @@ from manip_il.evaluation.rounds import costs_of
 from manip_il.evaluation.side import Side
 from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
 
-INK, SOFT, RULE = "#1d2126", "#5b636d", "#e3e5e8"
+INK = "#1d2126"
+SOFT = "#5b636d"
+RULE = "#e3e5e8"
 COLOURS = (DAGGER, CLONING, EXPERT, "#a6408a", "#9a6f00", "#2f8fc4", "#7a4a2b")
 _MARKERS = ("o-", "s-", "D-", "^-")  # distinguishable without colour
 _PANEL = (4.4, 3.0)  # size of a figure placed beside others [inches]

@@ -133,7 +133,9 @@ class PairCounts:
         Newcombe (1998), Statistics in Medicine 17, 2635-2650, method 10: combines the distances of Wilson's limits
         from both rates, allowing for the continuity-corrected correlation of the outcomes.
         """
-        n, right, left = self.n, self.both + self.only_right, self.both + self.only_left
+        n = self.n
+        right = self.both + self.only_right
+        left = self.both + self.only_left
         (l1, u1), (l2, u2) = wilson_interval(right, n), wilson_interval(left, n)
         p1, p2 = right / n, left / n
         cross = self.both * self.neither - self.only_right * self.only_left

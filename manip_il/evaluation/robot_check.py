@@ -140,7 +140,9 @@ def check_starts(name: NameOrPath, task: str) -> TaskCheck:
 
 def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
     """Return whether the hand, pointing down, reaches each point of an n x n grid on the table, row by row along x."""
-    reach, (x, y), steps = reach_of(robot), robot.workspace.centre, np.linspace(-half, half, n).tolist()
+    reach = reach_of(robot)
+    x, y = robot.workspace.centre
+    steps = np.linspace(-half, half, n).tolist()
     return [[reach.has((x + dx, y + dy, LOW)) for dx in steps] for dy in steps]
 
 
@@ -262,7 +264,9 @@ def looks(name: NameOrPath) -> Figure:
     points = np.vstack([data.xpos[1:], corners])
     low, high = points.min(axis=0), points.max(axis=0)
     outside = mujoco.MjvCamera()
-    outside.lookat[:], outside.azimuth, outside.elevation = (low + high) / 2, 55.0, -20.0
+    outside.lookat[:] = (low + high) / 2
+    outside.azimuth = 55.0
+    outside.elevation = -20.0
     outside.distance = 0.6 * float(np.linalg.norm(high - low)) / math.sin(math.radians(22.5))
     data.mocap_pos[:, 2] = -9.0  # move goals out of sight
     views = {"from outside": outside, "what camera front sees": "front", "what camera wrist sees": "wrist"}

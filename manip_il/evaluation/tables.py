@@ -13,7 +13,10 @@ from manip_il.errors import printable
 
 INTERVAL = "[95 % interval]"  # part of a column's header; see `CONFIDENCE`
 # after Okabe and Ito's palette, distinguishable with every kind of colour blindness
-DAGGER, CLONING, EXPERT, BASELINE = "#0072b2", "#d55e00", "#00835f", "#868e98"
+DAGGER = "#0072b2"
+CLONING = "#d55e00"
+EXPERT = "#00835f"
+BASELINE = "#868e98"
 _PLAIN_WIDTH = 240  # files and pipes have no width to wrap lines at
 
 

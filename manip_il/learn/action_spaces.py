@@ -53,7 +53,9 @@ if TYPE_CHECKING:  # importing inverse kinematics takes a second
 
 LAST = (-1,)  # index of the gripper's opening, for a single arm
 _ARM = slice(None, -1)  # joints of a single arm, in state and action
-_POSITION, _ROTATION, _POSE = slice(0, 3), slice(3, 6), 6
+_POSITION = slice(0, 3)
+_ROTATION = slice(3, 6)
+_POSE = 6
 Numbers = TypeVar("Numbers", bound=np.floating[Any])
 
 

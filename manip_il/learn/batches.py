@@ -34,7 +34,9 @@ class Order:
     """
 
     def __init__(self, rows: int, weights: F64 | None, batch_size: int, seed: int) -> None:
-        self.rows, self.batch_size, self.seed = rows, batch_size, seed
+        self.rows = rows
+        self.batch_size = batch_size
+        self.seed = seed
         self._edges = None if weights is None else np.cumsum(weights) / weights.sum()
         self._epoch, self._order = -1, np.empty(0, np.int64)
 

@@ -20,7 +20,9 @@ from manip_il.errors import ManipError, MismatchError, UnknownName
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
 from manip_il.sim.config import CameraConfig, Look
 
-CONFIG, WEIGHTS, META_FILE = "config.json", "model.safetensors", "manip_il.json"
+CONFIG = "config.json"
+WEIGHTS = "model.safetensors"
+META_FILE = "manip_il.json"
 MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that convert actions
 JOINTS_ALONE = "manip_il_joints_alone"  # step of a policy that observes nothing else
 _STEPS = (  # registry names of LeRobot's default steps, and ours: they load nothing

@@ -181,7 +181,9 @@ class CNNPolicy(MLPPolicy):
             encoder(self._at_size(key, batch)) for encoder, key in zip(self.encoders, self.cameras, strict=True)
         ]
         seen = torch.cat([*(batch[key] for key in self.inputs), *keypoints], dim=-1)
-        parts, around, config = [seen], batch.get(ENVIRONMENT_STATE), cast(CNNConfig, self.config)
+        parts = [seen]
+        around = batch.get(ENVIRONMENT_STATE)
+        config = cast(CNNConfig, self.config)
         with torch.autocast(seen.device.type, enabled=False):
             if self.privileged is not None:
                 n = batch[STATE].shape[1]
@@ -279,7 +281,9 @@ class CNNPolicy(MLPPolicy):
 
     @override
     def _learn_columns(self, columns: Table) -> None:
-        config, truth, places = cast(CNNConfig, self.config), self._truth(columns), self._places(columns)
+        config = cast(CNNConfig, self.config)
+        truth = self._truth(columns)
+        places = self._places(columns)
         sizes = 0 if truth is None else truth.shape[1], 0 if places is None else places.shape[2]
         if not config.privileged_size and not config.named_points and any(sizes):
             config.privileged_size, config.named_points = sizes

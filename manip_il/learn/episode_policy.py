@@ -46,7 +46,10 @@ class EpisodePolicy:
         task: str = "",
     ):
         policy.reset()
-        self.module, self._before, self._after, self._task = policy, before, after, task
+        self.module = policy
+        self._before = before
+        self._after = after
+        self._task = task
         self._device = torch.device(policy.config.device or "cpu")
         self._shared = {id(part): part for part in (policy.config, *policy.parameters(), *policy.buffers())}
         self._instructions: dict[int, str] = {}

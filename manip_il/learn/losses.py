@@ -96,7 +96,9 @@ class MixtureHead(Head):
     """
 
     def __init__(self, n: int, components: int) -> None:
-        self.n, self.components, self.size = n, components, components * (1 + 2 * n)
+        self.n = n
+        self.components = components
+        self.size = components * (1 + 2 * n)
 
     def split(self, params: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return log-weights (B, K), means (B, K, n), log-deviations (B, K, n)."""
@@ -133,7 +135,9 @@ class CategoricalHead(Head):
     """
 
     def __init__(self, n: int, bins: int, sigma: float = 0.0) -> None:
-        self.n, self.bins, self.sigma = n, bins, sigma
+        self.n = n
+        self.bins = bins
+        self.sigma = sigma
         self.pad = math.ceil(_REACH * sigma)
         self.total = bins + 2 * self.pad
         self.size = n * self.total

@@ -1,6 +1,7 @@
 """Names of policy types, observations and action spaces. Imports nothing, so that help is fast."""
 
-JOINT_TARGET, JOINT_DELTA, EE_DELTA = ACTION_SPACES = ("joint_target", "joint_delta", "ee_delta")
+ACTION_SPACES = ("joint_target", "joint_delta", "ee_delta")
+JOINT_TARGET, JOINT_DELTA, EE_DELTA = ACTION_SPACES
 MLP, CNN = OWN_SPACE = ("mlp", "cnn")  # policies whose network converts actions itself, by default from joint_delta
 CONVERTED = (*OWN_SPACE, "act", "diffusion", "vqbet")  # policies whose actions may be converted
 PLAIN = ("act", "cnn", "diffusion", "gaussian_actor", "mlp", "tdmpc", "vqbet")  # policies that load no models by name

@@ -66,7 +66,9 @@ class Shape:
 
     def __post_init__(self) -> None:
         self.sigma = SIGMA if self.sigma is None else self.sigma
-        self.scales, self.scaled, self.grippers = tuple(self.scales), tuple(self.scaled), tuple(self.grippers)
+        self.scales = tuple(self.scales)
+        self.scaled = tuple(self.scaled)
+        self.grippers = tuple(self.grippers)
         check_bounds(self, "policy.")
         for name, known in (("loss", LOSSES), ("activation", ACTIVATIONS), ("action_space", ACTION_SPACES)):
             if (value := getattr(self, name)) not in known:
@@ -141,11 +143,15 @@ class MLPNetwork(nn.Module):
 
     def __init__(self, inputs: int, n: int, shape: Shape) -> None:
         super().__init__()
-        self.n, self.clamp, self.loss = n, shape.clamp, shape.loss
+        self.n = n
+        self.clamp = shape.clamp
+        self.loss = shape.loss
         added = torch.full((n,), float(shape.action_space == JOINT_DELTA))
         added[list(shape.grippers)] = 0.0
         self.register_buffer("added", added, persistent=False)
-        self.scales, self.scaled, self.inputs = shape.scales, list(shape.scaled), inputs
+        self.scales = shape.scales
+        self.scaled = list(shape.scaled)
+        self.inputs = inputs
         inputs += len(shape.scales) * len(shape.scaled)
         self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins, sigma=shape.sigma or 0.0)
         activation = ACTIVATIONS[shape.activation]

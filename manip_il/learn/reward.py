@@ -38,7 +38,9 @@ PREFERENCE = "preference"  # type of a learnt reward in config.json
 _KINDS = {STATE: "STATE", ENVIRONMENT_STATE: "ENV", ACTION: "ACTION"}  # LeRobot's types of the inputs
 _ROWS = 16_384  # rows evaluated at a time
 BY_CHANCE = 0.1  # E, the share of random answers
-_LR, _WEIGHT_DECAY, _BATCH = 1e-4, 1.0, 16
+_LR = 1e-4
+_WEIGHT_DECAY = 1.0
+_BATCH = 16
 _EPOCHS, _PATIENCE = 200, 15
 _RANGE = (0.01, 0.99)  # quantiles of the frames' rewards that become 0 and 1
 

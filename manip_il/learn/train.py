@@ -112,7 +112,9 @@ class Trainer:
         self.origin = self._origin(datasets, shares, space)
         self.pipeline.dataset = DatasetConfig(self.meta.repo_id, root=str(_portable(datasets[-1].root)))
         self.pipeline.output_dir = output_dir
-        self.steps, self.batch_size, self.step = self.pipeline.steps, self.pipeline.batch_size, 0
+        self.steps = self.pipeline.steps
+        self.batch_size = self.pipeline.batch_size
+        self.step = 0
         with threads(config.threads):
             self._build(policy, checkpoint)
         world = self.accelerator.num_processes
@@ -176,7 +178,9 @@ class Trainer:
 
     def run(self) -> Iterator[dict[str, Any]]:
         """Take the remaining steps; yield metrics after every `log_freq`-th and the last step, {} after the others."""
-        preset, since, started = self.pipeline.optimizer, self.step, time.perf_counter()
+        preset = self.pipeline.optimizer
+        since = self.step
+        started = time.perf_counter()
         assert preset is not None
         metrics = MetricsTracker(1, 1, 1, {name: AverageMeter(name) for name in _METRICS})
         while self.step < self.steps:

@@ -32,7 +32,9 @@ from manip_il.learn.checkpoint import META_FILE, Origin
 if TYPE_CHECKING:  # LeRobot takes seconds to import
     from lerobot.configs.train import TrainPipelineConfig
 
-PRETRAINED_MODEL, TRAINING_STATE, STEP_FILE = "pretrained_model", "training_state", "training_step.json"
+PRETRAINED_MODEL = "pretrained_model"
+TRAINING_STATE = "training_state"
+STEP_FILE = "training_step.json"
 METRICS_FILE, TENSORBOARD_FOLDER = "metrics.jsonl", "tensorboard"
 Writer = Callable[[Record], None]
 

@@ -93,6 +93,8 @@ def _picture(message: Any) -> U8:
     encoding = getattr(message, "encoding", "none")  # RawImage of Foxglove, Image of ROS
     if encoding not in _CHANNELS:
         raise ValueError(f"the picture is encoded as {encoding!r}; expected {' or '.join(_CHANNELS)}, PNG or JPEG")
-    height, width, step = message.height, message.width, message.step or message.width * 3
+    height = message.height
+    width = message.width
+    step = message.step or message.width * 3
     rows = np.frombuffer(message.data, np.uint8).reshape(height, step)  # rows may be padded
     return np.ascontiguousarray(rows[:, : width * 3].reshape(height, width, 3)[:, :, _CHANNELS[encoding]])

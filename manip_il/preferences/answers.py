@@ -25,7 +25,8 @@ from manip_il.preferences.pairs import Clips, Pairs, read_file
 
 FILE_NAME = "preferences.json"
 FORMAT, VERSION = "manip_il preferences", 1
-LEFT, RIGHT, EQUAL, SKIP = ANSWERS = ("left", "right", "equal", "skip")
+ANSWERS = ("left", "right", "equal", "skip")
+LEFT, RIGHT, EQUAL, SKIP = ANSWERS
 BETTER = {LEFT: 1.0, RIGHT: 0.0, EQUAL: 0.5}  # probability that the left clip is better
 _ROUNDING = 1e-9  # returns that differ by less than this are equal
 

@@ -21,7 +21,9 @@ _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 def outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> F64:
     """Return points around a geom in the world, (n, 3) [m]: its mesh's vertices, or its box's corners."""
-    mesh, middle, half = int(model.geom_dataid[geom]), model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    mesh = int(model.geom_dataid[geom])
+    middle = model.geom_aabb[geom, :3]
+    half = model.geom_aabb[geom, 3:]
     points = middle + half * _CORNERS
     if mesh >= 0:  # the corners of its box would be too far out, as a mesh may be rotated in its geom
         start = model.mesh_vertadr[mesh]
@@ -54,11 +56,16 @@ def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, e
 def nearest(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[Sequence[int]]) -> tuple[tuple[int, int], F64]:
     """Return the nearest pair of a geom in the first group and one in another, with their nearest points (2, 3) [m]."""
     first, *rest = groups
-    least, pair, points, ends = np.inf, (first[0], rest[0][0]), np.zeros(6), np.empty(6)
+    least = np.inf
+    pair = (first[0], rest[0][0])
+    points = np.zeros(6)
+    ends = np.empty(6)
     for one, other in itertools.product(first, [geom for group in rest for geom in group]):
         apart = distance(model, data, one, other, ends)
         if apart < least:
-            least, pair, points = apart, (one, other), ends.copy()
+            least = apart
+            pair = (one, other)
+            points = ends.copy()
     return pair, points.reshape(2, 3)
 
 

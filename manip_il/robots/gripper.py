@@ -151,7 +151,10 @@ def sweep(robot: Robot) -> Sweep:
     least = [min(float(gap.min()) for gap in one) for one in gaps]
     shut = max((place for place, gap in enumerate(least) if gap <= 0), default=0)  # last pose with touching tips
     pads = [_near(gap, tip, float(gap.min())) for gap, tip in zip(gaps[shut], tips, strict=True)]
-    openings, middles, shares, wide = [], [], shares[shut:], poses[shut:]
+    openings = []
+    middles = []
+    shares = shares[shut:]
+    wide = poses[shut:]
     for pose in wide:
         openings.append(min(float(one.min()) for one in gaps_at(pose, pads)))
         middle = nearest(model, data, pads)[1].mean(axis=0) - data.site("ee").xpos

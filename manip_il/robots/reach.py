@@ -86,7 +86,9 @@ class Reach:
 
     def has(self, position: Sequence[float] | F64) -> bool:
         """Return whether the hand reaches all corners of the map's cell that contains `position` (3,) [m]."""
-        cells, (x, y, z), (first_x, first_y, first_z) = self._arrives, position, self._corner
+        cells = self._arrives
+        x, y, z = position
+        first_x, first_y, first_z = self._corner
         x, y, z = (math.floor(at / _CELL) for at in (x - first_x, y - first_y, z - first_z))
         if not (0 <= x < len(cells) and 0 <= y < len(cells[0]) and 0 <= z < len(cells[0][0])):
             return False
@@ -157,7 +159,9 @@ def _solve(robot: Robot) -> Reach:
     """Compute the map: how far from every point of the grid the hand ends."""
     from manip_il.robots.ik import ArmIK  # mink is slow to import, and a stored map does not need it
 
-    ik, body, space = ArmIK(robot), Body(robot), robot.workspace
+    ik = ArmIK(robot)
+    body = Body(robot)
+    space = robot.workspace
     half = space.half_width + _BEYOND
     origin = np.array([space.centre[0] - half, space.centre[1] - half, 0.0])
     shape = tuple(round(size / _CELL) + 1 for size in (2 * half, 2 * half, space.height + _ABOVE))
@@ -175,7 +179,9 @@ def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
 
     The error includes the angle, converted to a length.
     """
-    yaw, q, (low, high) = ik.ahead(position), np.asarray(robot.home, dtype=np.float64), ik.limits.T
+    yaw = ik.ahead(position)
+    q = np.asarray(robot.home, dtype=np.float64)
+    low, high = ik.limits.T
     down, miss = hand_down(yaw), np.inf
     for _ in range(_STEPS):
         ee, rotation = ik.ee_pose(q)

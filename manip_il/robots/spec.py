@@ -142,7 +142,10 @@ def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, place: Sequence
 
     model: the compiled arm. The camera looks along its -z, and its x is parallel to the hand's y.
     """
-    rotation, quat, side, site = np.zeros(9), np.zeros(4), np.sign(place[0]) or 1.0, model.site("ee")
+    rotation = np.zeros(9)
+    quat = np.zeros(4)
+    side = np.sign(place[0]) or 1.0
+    site = model.site("ee")
     mujoco.mju_quat2Mat(rotation, site.quat)
     back = np.array([side * np.sin(_TILT), 0, -np.cos(_TILT)])
     right = np.array([0.0, side, 0.0])
@@ -313,7 +316,9 @@ def _motorise(robot: Robot, spec: mujoco.MjSpec) -> None:
     """Give the joints of arm and gripper position control in place of the model's motors."""
     for name, kp, force, armature in zip(robot.joints, robot.gains, robot.forces, robot.armature, strict=True):
         joint = spec.joint(name)
-        joint.damping, joint.stiffness, joint.armature = np.array([_DAMPING, 0, 0]), np.zeros(3), armature
+        joint.damping = np.array([_DAMPING, 0, 0])
+        joint.stiffness = np.zeros(3)
+        joint.armature = armature
         joint.frictionloss = 0.0  # a servo's own controller overcomes friction
         _position_actuator(spec, joint, (kp, kp * _KV_PER_KP, force))
     for name, ends in zip(

@@ -106,7 +106,9 @@ class Bus:
     def goals(self) -> F64:
         """Return the servos' last goals, clipped to their limits [rad], (n,)."""
         with self.lock:
-            low, high, goal = self["Min_Position_Limit"], self["Max_Position_Limit"], self["Goal_Position"]
+            low = self["Min_Position_Limit"]
+            high = self["Max_Position_Limit"]
+            goal = self["Goal_Position"]
             encoder = np.where(low < high, np.clip(goal, low, high), goal) + self["Homing_Offset"]
         return np.asarray((encoder - _CENTRE) * STEP, float)
 
@@ -145,7 +147,9 @@ class Bus:
             self._waiting = line = self._waiting[begin:]
             if len(line) < 4:
                 break
-            number, length, body = line[2], line[3], line[2 : 3 + line[3]]
+            number = line[2]
+            length = line[3]
+            body = line[2 : 3 + line[3]]
             sound = number != 0xFF and 2 <= length <= _LONGEST
             if sound and len(line) < 4 + length:
                 break

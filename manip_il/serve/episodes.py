@@ -31,7 +31,9 @@ class ServedEpisodes:
     """
 
     def __init__(self, station: Station, config: EnvConfig, folder: Path | None, seed: int, leader: Mover):
-        self._station, self._env, self._leader = station, env_of(config), leader
+        self._station = station
+        self._env = env_of(config)
+        self._leader = leader
         self._expert, self.driver = Expert(self._env.scene), Actor.EXPERT
         self._reads: list[tuple[Read, Actor]] = []
         self._running = False
@@ -74,7 +76,9 @@ class ServedEpisodes:
 
     def end(self, *, keep: bool) -> None:
         """End the episode; if it is to be kept, write its journal at once."""
-        reads, self._reads, self._running = [*self._reads, (self._station.look(), self.driver)], [], False
+        reads = [*self._reads, (self._station.look(), self.driver)]
+        self._reads = []
+        self._running = False
         if self._journal is not None and keep and len(reads) > 1:
             frames = [self._transition(step, reads) for step in range(len(reads) - 1)]
             self._journal.write(to_episode(frames))

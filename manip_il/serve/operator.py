@@ -20,7 +20,12 @@ from manip_il.mdp import Actor
 from manip_il.serve.episodes import ServedEpisodes
 from manip_il.serve.station import Read, Station
 
-RIGHT, LEFT, ENTER, PAUSE, CORRECT, INTERRUPT = b"\x1b[C", b"\x1b[D", b"\n", b" ", b"\t", b"\x03"
+RIGHT = b"\x1b[C"
+LEFT = b"\x1b[D"
+ENTER = b"\n"
+PAUSE = b" "
+CORRECT = b"\t"
+INTERRUPT = b"\x03"
 _SETTLED = 0.5  # time for a new world, or a joint at the end of its range, to settle before a key is pressed [s]
 _TERMINAL = 0.001  # time for printed text to arrive [s]
 _PATIENCE = 2  # number of horizons after which an episode counts as failed
@@ -39,8 +44,13 @@ class Operator:
     """
 
     def __init__(self, command: Sequence[str], station: Station, episodes: ServedEpisodes, intervene: float):
-        self._station, self._episodes, self._intervene = station, episodes, intervene
-        self._driver, self._keep, self.solved, self.failed = Actor.EXPERT, True, 0, 0
+        self._station = station
+        self._episodes = episodes
+        self._intervene = intervene
+        self._driver = Actor.EXPERT
+        self._keep = True
+        self.solved = 0
+        self.failed = 0
         self._heard, self.status = "", None
         self._happened = deque[str | Read]()
         self._says = [  # what LeRobot's programs print, and the reaction to it

@@ -25,11 +25,15 @@ class Follower:
 
     def __init__(self, world: World, bus: Bus, step: float):
         scene, model = world.scene, world.scene.model
-        self._world, self._bus, self._step = world, bus, step
+        self._world = world
+        self._bus = bus
+        self._step = step
         self.q = np.array([*scene.arm_q, *scene.gripper.q])
         self._ctrl = np.array([*scene.arm_ctrl, *scene.gripper.ctrl])
         self._dof = model.jnt_dofadr[[int(np.flatnonzero(model.jnt_qposadr == q)[0]) for q in self.q]]
-        self._at, self._on, self._coming = np.zeros(len(self.q)), np.zeros(len(self.q), bool), deque[F64]()
+        self._at = np.zeros(len(self.q))
+        self._on = np.zeros(len(self.q), bool)
+        self._coming = deque[F64]()
 
     def reset(self, config: ServoConfig) -> None:
         """Use servos with these parameters; the current joint positions become their goals."""
@@ -61,10 +65,14 @@ class Follower:
 
     def command(self) -> None:
         """Set the motors from the registers; call this every `step` seconds."""
-        data, model, bus = self._world.data, self._world.model, self._bus
+        data = self._world.data
+        model = self._world.model
+        bus = self._bus
         q = data.qpos[self.q]
         with bus.lock:
-            on, gain, goal = bus["Torque_Enable"] > 0, self._gain(), self.goal()
+            on = bus["Torque_Enable"] > 0
+            gain = self._gain()
+            goal = self.goal()
             dead = STEP * bus["CW_Dead_Zone"]
             limit = np.minimum(bus["Max_Torque_Limit"], bus["Torque_Limit"]) / 1000
         self._coming.append(goal)

@@ -110,7 +110,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     def start(self, seed: int) -> None:
         """Start the episode of a seed: `reset` without making an observation."""
-        world, scene, rng = self.world, self.scene, rng_for(seed, "reset")
+        world = self.world
+        scene = self.scene
+        rng = rng_for(seed, "reset")
         self._begin(seed)
         world.vary(with_drawn(scene.nominal, self.drawn))
         data, robot = world.data, scene.robot
@@ -131,7 +133,10 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._seed = seed
         drawn = draw(self._conditions, seed, ANY if self.scene.draws_shape else "")
         self.drawn = drawn
-        self._step, self._streak, self._ever, self._begun = 0, 0, False, False
+        self._step = 0
+        self._streak = 0
+        self._ever = False
+        self._begun = False
         self._events = Events(self.world, drawn, seed)
         self._delay = drawn.get("delay", 0)
         self._seen: deque[Observation] = deque(maxlen=self._delay + drawn.get("picture_delay", 0) + 1)
@@ -216,7 +221,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.world.restore(state.physics, state.variation)
         if state.seed is not None:
             self._begin(state.seed)
-        self._step, self._streak, self._ever = state.step, state.streak, state.ever
+        self._step = state.step
+        self._streak = state.streak
+        self._ever = state.ever
         self._begun = state.begun
         self._seen.clear()
 

@@ -172,7 +172,9 @@ class Events:
     """Events of one episode: `drawn` says which, how strong and when; directions and noise are drawn from the seed."""
 
     def __init__(self, world: World, drawn: Mapping[str, Any], seed: int):
-        self._world, self._drawn, self._seed = world, drawn, seed
+        self._world = world
+        self._drawn = drawn
+        self._seed = seed
         self._kinds = {moment: (name, KINDS[name]) for name, moment in drawn.items() if name in KINDS}
 
     def before(self, step: int) -> bool:

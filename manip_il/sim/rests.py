@@ -62,7 +62,9 @@ class Hull:
     def __init__(self, model: mujoco.MjModel, body: int, geom: int, lowest: float, widest: float):
         """Use a body's mesh, and a gripper that opens to `widest` [m] and whose `ee` gets down to `lowest` [m]."""
         points = _few(_vertices(model, geom))
-        self._hull, self._centre, self._gripper = ConvexHull(points), model.body_ipos[body].copy(), (lowest, widest)
+        self._hull = ConvexHull(points)
+        self._centre = model.body_ipos[body].copy()
+        self._gripper = (lowest, widest)
         self._rests: dict[int, Rest] = {}
         self.downs = _resting(self._hull, self._centre)
         self.extents = tuple[float, ...]((2 * np.abs(points).max(axis=0)).tolist())

@@ -188,7 +188,8 @@ def _action_space(robot: Robot, joints: list[Any], gripper: Gripper) -> ActionSp
         units = ServoUnits(openings, robot.lerobot.percent(driven))
         ends = np.sort(units.percents[[0, -1]])
         low, high, scale = (np.degrees(one) for one in (low, high, scale))
-        low[-1], high[-1], scale[-1] = *ends, np.ptp(ends)
+        low[-1], high[-1] = ends
+        scale[-1] = np.ptp(ends)
     return ActionSpace(robot.joint_names, low, high, scale, relative, units)
 
 

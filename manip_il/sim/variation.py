@@ -27,7 +27,9 @@ GEOMS = {
 KINDS = {int(geom): kind for kind, geom in GEOMS.items()}
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 PER_OBJECT = 5
-_SIZE, _MASS, _FRICTION = slice(0, 3), 3, 4
+_SIZE = slice(0, 3)
+_MASS = 3
+_FRICTION = 4
 _SHAPE = 0  # the place after the objects' numbers: `OWN`, or MuJoCo's geom type if a shape is drawn
 WORLD_SIZE = 1 + sum(len(quantity.places) for quantity in RANGES.values())
 NOTHING_DRAWN = np.full(WORLD_SIZE, OWN)  # the world's numbers, (w,)
@@ -136,13 +138,19 @@ def apply(
 
 def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, shape: int | None) -> None:
     geom, body = one.geom, one.body
-    size, mass, friction = row[_SIZE], float(row[_MASS]), float(row[_FRICTION])
+    size = row[_SIZE]
+    mass = float(row[_MASS])
+    friction = float(row[_FRICTION])
     own = int(plain.geom_type[geom])
-    kind, condim, rolling = own, int(plain.geom_condim[geom]), float(plain.geom_friction[geom, 2])
+    kind = own
+    condim = int(plain.geom_condim[geom])
+    rolling = float(plain.geom_friction[geom, 2])
     if shape is not None:
         kind, (condim, rolling) = shape, contact(KINDS[shape])
     nodes = slice(plain.body_bvhadr[body], plain.body_bvhadr[body] + plain.body_bvhnum[body])
-    like, at, bounds = plain, geom, plain.bvh_aabb[nodes, 3:]
+    like = plain
+    at = geom
+    bounds = plain.bvh_aabb[nodes, 3:]
     inertia = plain.body_inertia[body] * (mass / plain.body_mass[body])
     if own != _MESH and (kind != own or not np.array_equal(size, plain.geom_size[geom])):
         like, at = _solid(kind, size, mass), 0

@@ -24,7 +24,11 @@ from manip_il.sim.view import ViewModel
 from manip_il.sim.world import STATE_KIND, Scene
 
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of X11 and Wayland
-_LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION = 0.15, 1.9, 140.0, -25.0  # initial camera: target's height [m], [m], [deg]
+# initial camera: target's height [m], [m], [deg]
+_LOOK_AT = 0.15
+_DISTANCE = 1.9
+_AZIMUTH = 140.0
+_ELEVATION = -25.0
 _CLOSING = 5.0  # longest wait for each of the viewer's threads [s]
 
 
@@ -80,7 +84,9 @@ class Window:
         with self._handle.lock():
             camera = self._handle.cam
             camera.lookat[:] = [*scene.robot.workspace.centre, _LOOK_AT]
-            camera.distance, camera.azimuth, camera.elevation = _DISTANCE, _AZIMUTH, _ELEVATION
+            camera.distance = _DISTANCE
+            camera.azimuth = _AZIMUTH
+            camera.elevation = _ELEVATION
 
     @property
     def is_open(self) -> bool:

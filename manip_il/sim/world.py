@@ -103,7 +103,9 @@ class World:
     """
 
     def __init__(self, scene: Scene):
-        self.scene, self.robot, self.gripper = scene, scene.robot, scene.gripper
+        self.scene = scene
+        self.robot = scene.robot
+        self.gripper = scene.gripper
         self.variation = scene.nominal
         self._plain = scene.model, mujoco.MjData(scene.model)
         self._own: tuple[mujoco.MjModel, mujoco.MjData] | None = None

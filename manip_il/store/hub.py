@@ -90,7 +90,9 @@ class Hub:
             text = "expected hf://datasets/USER/NAME[@REVISION] or hf://USER/NAME[@REVISION], and one revision"
             raise UsageError(f"the hf:// address is invalid; {text}")
         self.kind: Kind = "dataset" if found[1] == "datasets/" else "policy"
-        self._place, self._revision, self._private = found[2], revision or found[3], private
+        self._place = found[2]
+        self._revision = revision or found[3]
+        self._private = private
         self._repo: Any = {"repo_id": self._place, "repo_type": "dataset" if self.kind == "dataset" else "model"}
         self.name = f"hf://{found[1] or ''}{self._place}{f'@{self._revision}' if self._revision else ''}"
         _use_client()

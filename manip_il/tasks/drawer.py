@@ -29,14 +29,23 @@ from manip_il.tasks.pick_place import OBJECT, observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw
 
-CABINET, TRAY, BAR = "cabinet", "drawer", "handle"
+CABINET = "cabinet"
+TRAY = "drawer"
+BAR = "handle"
 # The cabinet's frame lies on the table under the handle of the closed drawer, x into the cabinet.
 GAP = 0.056  # distance of the handle's middle from the drawer's front [m]
 INSIDE = (0.05, 0.06)  # half the drawer's inner length and width [m]
-WALL, FLOOR, PANEL, THIN = 0.035, 0.010, 0.090, 0.004  # drawer: heights of walls, floor, front; half wall thickness [m]
+# drawer: heights of walls, floor, front; half wall thickness [m]
+WALL = 0.035
+FLOOR = 0.010
+PANEL = 0.090
+THIN = 0.004
 ROOF = 0.080  # inner height of the cabinet over the table [m]
 MIDDLE = GAP + 2 * THIN + INSIDE[0]  # distance of the drawer's inner middle from its handle [m]
-BAR_Z, BAR_HALF, BAR_LENGTH = 0.080, 0.006, 0.05  # handle: height, half its thickness, half its length [m]
+# handle: height, half its thickness, half its length [m]
+BAR_Z = 0.080
+BAR_HALF = 0.006
+BAR_LENGTH = 0.05
 OPEN = 0.12  # how far the drawer is pulled [m]
 HAND_Z = BAR_Z - 0.005  # height of the hand at the handle [m]
 HALF = 0.02  # half the cube's edge length [m]
@@ -54,7 +63,10 @@ MUCH_NEARER = 2.3  # how much nearer the yaw -pi/2 at the handle must be to be c
 LEFT = (0.03, 0.06, 0.03)  # offset from the handle beyond which the hand need not rise first: x, y, z [m]
 # In the cabinet's frame [m]: where an object is in the handle's way, x and y; x below which it lies in front of the
 # closed handle; and where it is put aside.
-WAY_X, WAY_Y, BEFORE, ASIDE = (-0.20, 0.07), 0.12, -0.06, (-0.04, 0.17)
+WAY_X = (-0.20, 0.07)
+WAY_Y = 0.12
+BEFORE = -0.06
+ASIDE = (-0.04, 0.17)
 _STEP = 0.04  # how far ahead of the hand its target runs while it moves the drawer [m]
 
 
@@ -133,7 +145,9 @@ def _at_bar(world: World) -> bool:
 
 def _to_bar(world: World) -> Target:
     """Move over the handle and down around it; a hand too low beside it only rises."""
-    ee, bar, yaw = world.ee, hand_at_handle(world), _yaw(world)
+    ee = world.ee
+    bar = hand_at_handle(world)
+    yaw = _yaw(world)
     off = math.hypot(*(bar - ee.position)[:2]) + 0.05 * max(0.0, angle_from_down(ee.rotation, yaw) - 0.1)
     height = min(HOVER, SLOPE * max(0.0, off - 0.006))
     if abs(world.opening - FINGERS) > 0.012:
@@ -254,7 +268,9 @@ class Drawer:
 
     def observe(self, world: World) -> Observed:
         """Return hand, cube and handle, how far the drawer is open, and the vectors between them."""
-        ee, bar, cube = world.ee.position, hand_at_handle(world), world.pose(OBJECT).position
+        ee = world.ee.position
+        bar = hand_at_handle(world)
+        cube = world.pose(OBJECT).position
         return {
             **observe_hand(world),
             **observe_object(world, OBJECT),

@@ -121,17 +121,23 @@ def lie_of(world: World, name: str) -> Lie:
 @once_per_state
 def grasp_of(world: World, name: str) -> Grasp:
     """Return the best grasp of an object from the hand's present pose."""
-    ee, position, lie = world.ee, world.pose(name).position, lie_of(world, name)
+    ee = world.ee
+    position = world.pose(name).position
+    lie = lie_of(world, name)
     neighbours = world.neighbours(name)
     yaw, width, length, (off_x, off_y, off_z) = _nearest(
         lie, world, position, world.gripper.most - LEAST_ROOM, neighbours
     )
     x, y, z = position.tolist()
-    x, y, z = x + off_x, y + off_y, z + off_z
+    x = x + off_x
+    y = y + off_y
+    z = z + off_z
     lean = 0.0 if world.robot.leans else world.reach.lean((x, y, z))
     angle = _beyond_lean(world.off_down(yaw), ee.rotation, lean)
     ee_x, ee_y, ee_z = ee.position.tolist()
-    dx, dy, dz = x - ee_x, y - ee_y, z - ee_z
+    dx = x - ee_x
+    dy = y - ee_y
+    dz = z - ee_z
     aside = world.gripper.middle(width + 2 * BESIDE_JAW)  # offset of the object for one moving jaw [m]
     at_x, at_y = x - aside * math.sin(yaw), y + aside * math.cos(yaw)
     room = max(0.0, world.gripper.most - width)  # clearance of the open gripper [m]
@@ -184,7 +190,9 @@ def _nearest(
     makes one of them the nearer. position: the object's (3,) [m]. widest: width that the fingers go around [m].
     neighbours: offsets (x, y) [m] of what stands around the object; grasps that they obstruct come last.
     """
-    grasps, at, ahead = lie.grasps[lie.level], world.hand_yaw, world.ahead(position)
+    grasps = lie.grasps[lie.level]
+    at = world.hand_yaw
+    ahead = world.ahead(position)
     if world.robot.faces_ahead:
         at = world.turned(position)
         grasps = [
@@ -216,7 +224,9 @@ def _nearest(
 def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float]]) -> float:
     """Return how much the open fingers of a grasp would hit a neighbour of the object, 0 to 1."""
     thick, half, clear = FINGER
-    c, s, worst = math.cos(yaw), math.sin(yaw), 0.0
+    c = math.cos(yaw)
+    s = math.sin(yaw)
+    worst = 0.0
     for x, y in neighbours:
         along, across = abs(s * x - c * y), abs(c * x + s * y)  # relative to the fingers' motion
         lack = min(1.0, max(0.0, (widest / 2 + thick - along) / SHORT))
@@ -273,7 +283,9 @@ def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
         (yaw - _QUARTER, length, width, _MIDDLE),
         (yaw + _QUARTER, length, width, _MIDDLE),
     )
-    folds, tilt, level = 4 if length == width else 2, math.acos(min(1.0, heights[up])), slice(None)
+    folds = 4 if length == width else 2
+    tilt = math.acos(min(1.0, heights[up]))
+    level = slice(None)
     if tilt >= MAX_TILT:  # it stands on an edge: the fingers meet the two sides that are upright
         level = slice(0, 1) if (heights[side] > heights[other]) != bool(quarters % 2) else slice(1, 3)
     return Lie(grasps, extents[up], tilt, folds, level)

@@ -34,14 +34,20 @@ from manip_il.tasks.peg import (
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import draw_resting_place, draw_until, draw_yaw, product, turn_left
 
-SIDE, LENGTH, MASS = 0.058, 0.10, 0.15  # peg [m], [m], [kg]
+# peg [m], [m], [kg]
+SIDE = 0.058
+LENGTH = 0.10
+MASS = 0.15
 DEPTH, WALL = 0.03, 0.018  # depth of the hole, and thickness of the walls around it [m]
 CHAMFER, SLIPPERY = 0.005, 0.05  # chamfer of the walls' inner edges, as high as wide [m], and its friction
 GUIDED = 0.003  # peg error up to which the chamfer guides it into the hole [m]
 AT_RIM, GENTLE = 0.005, 0.003  # within `AT_RIM` of the rim's height, the peg is lowered by at most `GENTLE` [m]
 EXACT = 0.02  # error below which the hand is placed exactly [m]
 IN = 0.003  # distance from the hole's floor at which the peg is inserted [m]
-SIDES, TILTED, STRAIN = (0.6, 1.75), 0.5, 4.0  # best yaws of a hand tilted by `TILTED` [rad]; weight of other yaws
+# best yaws of a hand tilted by `TILTED` [rad]; weight of other yaws
+SIDES = (0.6, 1.75)
+TILTED = 0.5
+STRAIN = 4.0
 NOT_NEARER = 0.10  # largest distance of the hole from the workspace's middle towards the robot, for a tilted hand [m]
 APART = 0.14  # least distance of peg and hole at the start [m]
 NOT_FARTHER = 0.05  # how far beyond the workspace's middle a lying peg may start [m]
@@ -56,7 +62,9 @@ def is_inserted(world: World) -> bool:
 @once_per_state
 def to_hole(world: World) -> Way:
     """Return the remaining motion of a hanging peg into the hole, in the easiest of the four rotations that fit."""
-    peg, hole, hand = world.pose(PEG), world.pose(HOLE), world.ee.rotation
+    peg = world.pose(PEG)
+    hole = world.pose(HOLE)
+    hand = world.ee.rotation
     in_hand = peg.rotation.T @ hand
     flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
     turns = (_quarter(hole.rotation, k, flip) @ in_hand for k in range(4))
@@ -156,7 +164,9 @@ class Insert:
 
     def observe(self, world: World) -> Observed:
         """Return hand, peg, hole, the vectors between them, and the hand's remaining rotation vector [rad]."""
-        peg, hole, lie = world.pose(PEG).position, world.pose(HOLE), lie_of(world, PEG)
+        peg = world.pose(PEG).position
+        hole = world.pose(HOLE)
+        lie = lie_of(world, PEG)
         yaw = angle_ahead(hole.rotation)
         way = to_hole(world)
         return {
@@ -203,4 +213,6 @@ def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
     add_part(hole, f"{name} edge", (CHAMFER / math.sqrt(2), inner + WALL, thick), (c * out, s * out, up), GREY)
     edge = hole.geoms[-1]
     turn = product(turn_left(yaw), np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0]))
-    edge.quat, edge.friction, edge.priority = turn, [SLIPPERY, 0.005, 0.0001], 1
+    edge.quat = turn
+    edge.friction = [SLIPPERY, 0.005, 0.0001]
+    edge.priority = 1

@@ -27,7 +27,10 @@ LEAN = math.radians(69)  # lean of the hand back over a lying peg's outer end, w
 LEAN_BY_ROOM = 3.0  # largest lean per distance to the end of the arm's reach: leaning moves the wrist outwards [rad/m]
 AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # errors up to which to close, to keep closing [m]
 AT_ANGLE = 0.25  # angle to the grip up to which to close [rad]
-OVER, SLOPE, FREE = 0.065, 2.0, 0.006  # height over the grip on approach [m], and per error; tolerated error [m]
+# height over the grip on approach [m], and per error; tolerated error [m]
+OVER = 0.065
+SLOPE = 2.0
+FREE = 0.006
 BARE = 0.012  # how far outside the peg's faces and ends a hand that holds it may be [m]
 ASLANT = 0.75  # angle to the peg's axis above which the hand must set the peg up before carrying it [rad]
 LIFT, LIFT_SLOPE = 0.015, 2.5  # height of the peg's lower end over the rim [m]; height per error

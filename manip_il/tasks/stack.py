@@ -18,7 +18,10 @@ from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import draw_resting, draw_until, draw_yaw
 
 TOP, BASE = "top", "base"  # the cube that is carried, and the one that it is put on
-ON_XY, ON_Z, LEVEL = 0.015, 0.004, 0.1  # tolerances on the base: sideways, in height [m]; tilt [rad]
+# tolerances on the base: sideways, in height [m]; tilt [rad]
+ON_XY = 0.015
+ON_Z = 0.004
+LEVEL = 0.1
 LEANS_Z, LEANS = 0.008, 0.3  # the same for a cube in a leaning hand: in height [m]; tilt [rad]
 OVER_BASE = LiftProfile(most=0.06, slope=2.5, free=0.008, rise_first=0.03, max_step=0.05)  # carried cube over its place
 PRESS = 0.01  # how far below the base's top the cube is aimed, so that it makes contact [m]

@@ -18,7 +18,9 @@ from manip_il.mdp import F64
 from manip_il.seeding import rng_for
 
 OPEN_LOOPS = {0.8: "stable", 1.0: "marginal", 1.25: "unstable"}  # names of the poles a
-STEPS, DEMONSTRATIONS, ROLLOUTS = 40, 50, 500
+STEPS = 40
+DEMONSTRATIONS = 50
+ROLLOUTS = 500
 BACK = 0.5  # factor by which the expert shrinks the state in one step
 GUST = 1e-3  # standard deviation of a rollout's disturbance in each step
 NOISE = 0.1  # standard deviation of DART's noise on the expert's actions in demonstrations

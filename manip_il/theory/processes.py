@@ -94,7 +94,9 @@ def _walk(back: bool) -> tuple[F64, F64, F64]:
 
     back: whether the right action leads back from there.
     """
-    moves, rewards, beside = np.zeros((2, PLACES + 1, PLACES + 1)), np.zeros((2, PLACES + 1)), PLACES
+    moves = np.zeros((2, PLACES + 1, PLACES + 1))
+    rewards = np.zeros((2, PLACES + 1))
+    beside = PLACES
     moves[RIGHT, :PLACES, :PLACES] = 1 / PLACES
     moves[WRONG, :, beside] = 1.0
     moves[RIGHT, beside, :PLACES] = back / PLACES

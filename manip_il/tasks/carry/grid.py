@@ -64,7 +64,9 @@ class Grid:
     """
 
     def __init__(self, layout: Layout, robot: Robot):
-        self.layout, self.cell, self._robot = layout, CELL * layout.scale, robot
+        self.layout = layout
+        self.cell = CELL * layout.scale
+        self._robot = robot
         (x, y), half = robot.workspace.centre, robot.workspace.half_width + BEYOND * layout.scale
         goal, low = np.array(layout.goal), np.array([x - half, y - half, 0.0])
         sizes = np.array([2 * half, 2 * half, TOP * layout.scale])
@@ -219,7 +221,10 @@ class Descent:
         means = (price + np.array([4.0, 2.0, 4.0]) @ between + self._prices(ends)) / 12  # Simpson's rule
         off = np.linalg.norm(ends - position, axis=1)
         totals = off * means + self.costs[nodes]
-        nodes, ends, totals, off = nodes[free], ends[free], totals[free], off[free]
+        nodes = nodes[free]
+        ends = ends[free]
+        totals = totals[free]
+        off = off[free]
         return float(totals.min()), self._heading(position, price, nodes, ends, totals, off, spare)
 
     def _prices(self, points: F64) -> F64:

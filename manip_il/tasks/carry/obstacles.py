@@ -24,8 +24,12 @@ _ALIKE = 0.005  # difference of radii up to which parts count as one [m]
 _BARELY = 0.004  # clearance of a grasping hand from an obstacle beside it [m]
 PARKED = 0.25  # depth of absent obstacles below the table's top [m]
 _PLATE = (0.15, 0.36, 0.0005)  # half lengths of the visual plate beyond the edge [m]
-_DARK, _LID, _KEYS = (0.16, 0.17, 0.20), (0.62, 0.64, 0.68), (0.20, 0.21, 0.24)
-_CLAY, _WAX, _FLAME = (0.20, 0.45, 0.52), (0.96, 0.93, 0.84), (1.0, 0.62, 0.15)
+_DARK = (0.16, 0.17, 0.20)
+_LID = (0.62, 0.64, 0.68)
+_KEYS = (0.20, 0.21, 0.24)
+_CLAY = (0.20, 0.45, 0.52)
+_WAX = (0.96, 0.93, 0.84)
+_FLAME = (1.0, 0.62, 0.15)
 _LOOKS = {  # visual geoms: kind, half size and middle in shares of the obstacle's box, colour
     "vase": (
         ("CYLINDER", (0.60, 0.05), 0.05, _CLAY),

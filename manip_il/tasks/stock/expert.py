@@ -36,7 +36,10 @@ BOX = np.array([HALF + 0.0135, HALF + 0.0155])  # half sides of the area blocked
 CORNERS = [np.array([x, y]) * (BOX + 0.01) for x in (-1, 1) for y in (-1, 1)]  # waypoints around it [m]
 LOW, HIGH = 0.012, 0.05  # heights of the gripper over the cube's middle, to push it and to pass over it [m]
 AHEAD = 0.004  # gap between gripper and cube on arrival behind it [m]
-ALONG, ACROSS, BELOW = 0.028, 0.021, 0.03  # offsets from the place behind the cube within which the gripper pushes [m]
+# offsets from the place behind the cube within which the gripper pushes [m]
+ALONG = 0.028
+ACROSS = 0.021
+BELOW = 0.03
 LOOK = 0.003  # how far ahead the pushed cube's motion is predicted [s]
 DECELERATION = 9.0  # deceleration of a cube that slides on the table [m/s^2]
 AT_GOAL = 0.05  # [m]

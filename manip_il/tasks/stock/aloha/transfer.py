@@ -34,7 +34,10 @@ KEPT_OFF, ARRIVED = 0.12, 0.02  # largest gap between left hand and cube; `to_go
 LEFT_CLOSED = 0.025  # half the gap below which the left fingers hold the cube [m]
 OPENED, OPENING = 0.022, 0.004  # half the gap at which the right hand leaves; range over which its step grows [m]
 CLEAR = 0.12  # final distance of the right hand from the cube [m]
-CARRIED, HANDED, PARTING = 0.02, 0.03, 0.03  # longest joint steps: carrying, handing over, parting [rad]
+# longest joint steps: carrying, handing over, parting [rad]
+CARRIED = 0.02
+HANDED = 0.03
+PARTING = 0.03
 
 
 class Transfer(AlohaScene):
