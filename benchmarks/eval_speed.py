@@ -70,7 +70,7 @@ def fitted(robot: str, folder: Path, quick: bool) -> Path:
     count, steps = (10, 50) if quick else (200, 4_000)
     config = make_config(robot, TASK)
     demos = RolloutJob(config, hold=5).run(stream_seeds("demonstrations", count))
-    write_dataset(demos, folder / "dataset", env_spec(config), repo_id="local/demos", fingerprint={})
+    write_dataset(demos, folder / "dataset", env_spec(config), fingerprint={})
     return Trainer((Dataset.open(folder / "dataset"),), FitConfig(steps=steps), folder).fit()
 
 

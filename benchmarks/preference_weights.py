@@ -133,7 +133,7 @@ def join(good: Path, bad: Path, target: Path) -> None:
         rewrite_columns(dataset, part, map(as_recorded, dataset.stored_episodes()), own, dataset.stored_features)
     first, second = (dataset.info.episodes for dataset in datasets)
     count = min(first, second)
-    merge_datasets(made, target, [f"0:{count}", f"{first}:{first + count}"], repo_id="a/half")
+    merge_datasets(made, target, [f"0:{count}", f"{first}:{first + count}"])
 
 
 def as_recorded(episode: StoredEpisode) -> dict[str, np.ndarray]:

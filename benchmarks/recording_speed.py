@@ -133,7 +133,7 @@ def record_seconds(
                 between(episode_path(journals, episode.seed))
                 paused += time.perf_counter()
 
-    Recording("local/x", provenance=provenance(job)).make(rollouts(), root)
+    Recording(provenance=provenance(job)).make(rollouts(), root)
     return time.perf_counter() - started - paused
 
 

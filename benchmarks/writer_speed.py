@@ -80,7 +80,7 @@ def rate(write: Write, spec: s.RobotTaskSpec, episodes: list[Episode]) -> float:
 
 
 def ours(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode]) -> None:
-    write_dataset(episodes, root, spec, repo_id=REPO, fingerprint={}, video=VideoConfig("libsvtav1"))
+    write_dataset(episodes, root, spec, fingerprint={}, video=VideoConfig("libsvtav1"))
 
 
 def peer_default(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode], streaming: bool = False) -> None:

@@ -72,7 +72,7 @@ def record(
     journals = root.with_name(f"{root.name}.journals")
     for folder in (root, journals):
         require_replaceable(folder)
-    recording = Recording("local/recorded", provenance=provenance(job), only_labelled=not job.labels_all)
+    recording = Recording(provenance=provenance(job), only_labelled=not job.labels_all)
     with Engine(workers) as engine:
         if policy is None:
             seeds = stream_seeds("demonstrations", MAX_TRIES * episodes, seed)

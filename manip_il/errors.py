@@ -6,11 +6,13 @@ The command line prints a `ManipError` as one line on standard error and exits w
 from __future__ import annotations
 
 import difflib
+import reprlib
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 OWN = "manip_il_own_"  # prefix of the names of modules that are loaded from users' own files
 _LONGEST_PRINTED = 200  # [characters]
+_REPR = reprlib.Repr(maxstring=_LONGEST_PRINTED, maxlong=_LONGEST_PRINTED, maxother=_LONGEST_PRINTED)
 
 
 class ManipError(Exception):
@@ -89,20 +91,9 @@ def told(error: BaseException) -> str:
 
 
 def shorten(value: object) -> str:
-    """Return `repr(value)`, cut to at most 200 characters; the rest of a large structure is not printed at all."""
-    printed = repr(_first_values(value, iter(range(_LONGEST_PRINTED))))
+    """Return `repr(value)`, cut to at most 200 characters; a large structure is shown by its first values."""
+    printed = _REPR.repr(value)
     return printed if len(printed) <= _LONGEST_PRINTED else f"{printed[: _LONGEST_PRINTED - 3]}..."
-
-
-def _first_values(value: object, places: Iterator[int]) -> object:
-    """Copy texts, lists and dicts as far as `places` lasts, one place for each value, in the order of printing."""
-    if isinstance(value, str | bytes):
-        return value[:_LONGEST_PRINTED]
-    if type(value) is dict:
-        return {key: _first_values(one, places) for _, (key, one) in zip(places, value.items(), strict=False)}
-    if type(value) is list:
-        return [_first_values(one, places) for _, one in zip(places, value, strict=False)]
-    return value
 
 
 def silence_ffmpeg_warning() -> None:

@@ -92,7 +92,7 @@ def write(
     with pytest.MonkeyPatch.context() as patch:
         for name in ("DATA_FILES_SIZE_IN_MB", "VIDEO_FILES_SIZE_IN_MB") if size else ():
             patch.setattr(lerobot_layout, name, size)
-        write_dataset(episodes, root, spec, **({"repo_id": "someone/lift", "fingerprint": {}} | options))
+        write_dataset(episodes, root, spec, **({"fingerprint": {}} | options))
     return root
 
 

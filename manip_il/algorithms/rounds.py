@@ -117,26 +117,26 @@ def read_rollouts(folder: Path, round_: int, beta: float, *, queried_everywhere:
     return Rollouts(round_, dataset, beta, labels, queries, len(ends), successes, steps)
 
 
-def given_rollouts(folder: Path, datasets: Sequence[Path], repo_id: str) -> Rollouts:
+def given_rollouts(folder: Path, datasets: Sequence[Path]) -> Rollouts:
     """Return round 0 with the given datasets, if any; they are copied into the run."""
     root = folder / DATASET
     if not datasets:
         return Rollouts(0)
     if not root.is_dir():
         sources = {str(one): dataset_sha256(one) for one in datasets}
-        merge_datasets(datasets, root, repo_id=repo_id, provenance={"given": sources})
+        merge_datasets(datasets, root, provenance={"given": sources})
     given, labels = Dataset.open(root), _count_labels(root)
     return Rollouts(0, root, 1.0, labels, labels, given.info.episodes, given.count_successes(), len(given))
 
 
-def merge_rounds(datasets: Sequence[Path], root: Path, repo_id: str, best: int) -> None:
+def merge_rounds(datasets: Sequence[Path], root: Path, best: int) -> None:
     """Write all rounds' labels as one dataset, unless it exists. best: number of the best round, for the provenance."""
 
     def episodes(dataset: Path) -> int:
         return Dataset.open(dataset).info.episodes
 
     if datasets and not (root.is_dir() and episodes(root) == sum(map(episodes, datasets))):
-        merge_datasets(datasets, root, repo_id=repo_id, provenance={"best_round": best}, replace=True)
+        merge_datasets(datasets, root, provenance={"best_round": best}, replace=True)
 
 
 def _count_labels(root: Path) -> int:

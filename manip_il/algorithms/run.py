@@ -109,14 +109,14 @@ class Run:
             best = best_result(rounds)
             self._keep_best(best.policy)
             made = [one.dataset for one in self._made.values() if one.dataset is not None]
-            merge_rounds(made, self.folder / DATASET, f"local/{self.config.env.name}_dagger", best.number)
+            merge_rounds(made, self.folder / DATASET, best.number)
 
     def demonstrations(self, count: int, round_: int = 0) -> Rollouts:
         """Record a round with `count` successful expert episodes; in round 0 `config.datasets` may replace them."""
         here, config = self._folder(round_), self.config
         if round_ == 0 and (config.datasets or config.start):
             with self._clock.timed("collect"):
-                self._made[0] = given_rollouts(here, config.datasets, self._repo_id(0))
+                self._made[0] = given_rollouts(here, config.datasets)
             return self._made[0]
         self._watch.on_stage("collect", round_, count)
         with self._clock.timed("collect"):
@@ -125,7 +125,7 @@ class Run:
                 stream = f"round/{round_}" if round_ else "demonstrations"
                 seeds = stream_seeds(stream, MAX_TRIES * count, config.seed)
                 episodes = collect_successes(self._engine, job, seeds, count, here / JOURNALS, self._watch.on_episode)
-                recording = Recording(self._repo_id(round_), True, count, provenance(job), labels=self._budget(round_))
+                recording = Recording(True, count, provenance(job), labels=self._budget(round_))
                 record_round(here, job, episodes, recording)
             self._made[round_] = read_rollouts(here, round_, beta=1.0, queried_everywhere=True)
         return self._made[round_]
@@ -137,7 +137,7 @@ class Run:
             if not root.is_dir():
                 job = replace(expert_job(self.config, 0), cameras=None)
                 episodes = collect(self._engine, job, stream_seeds("held_out", count, self.config.seed), journals)
-                recording = Recording("local/held_out", provenance=provenance(job))
+                recording = Recording(provenance=provenance(job))
                 recording.write(journals)
                 recording.make(episodes, root)
             self._held_out_steps = sum(len(read_journal(path)[1]) for path in list_episodes(journals))
@@ -165,8 +165,8 @@ class Run:
                     collect(self._engine, hard, seeds[:first], here / JOURNALS, self._watch.on_episode),
                     collect(self._engine, job, seeds[first:], here / JOURNALS, self._watch.on_episode),
                 )
-                name, left = self._repo_id(round_), self._budget(round_)
-                recording = Recording(name, provenance=provenance(job), only_labelled=not job.labels_all, labels=left)
+                left = self._budget(round_)
+                recording = Recording(provenance=provenance(job), only_labelled=not job.labels_all, labels=left)
                 record_round(here, job, episodes, recording)
             everywhere = config.label == "per_state" and rule.kind in ("every", "safety")
             self._made[round_] = read_rollouts(here, round_, driver.beta, queried_everywhere=everywhere)
@@ -286,9 +286,6 @@ class Run:
 
     def _folder(self, round_: int) -> Path:
         return round_folder(self.folder, round_)
-
-    def _repo_id(self, round_: int) -> str:
-        return f"local/{self.config.env.name}_round_{round_}"
 
     def _budget(self, round_: int) -> int | None:
         """Labels that the budget still allows in a round; None without a budget."""

@@ -85,13 +85,12 @@ class MergeOptions(Replacing):
 
     def run(self) -> None:
         """Merge; the new dataset appears when it is complete."""
-        from manip_il.data.build import local_id, merge_datasets
+        from manip_il.data.build import merge_datasets
 
         with exclusive(self.output):
             require_writable(self.output, DATASET, self.overwrite, self.datasets)
-            repo_id = local_id(self.output.absolute().name)
             part = self.episodes, self.renamed
-            info = merge_datasets(self.datasets, self.output, *part, repo_id=repo_id, replace=self.overwrite)
+            info = merge_datasets(self.datasets, self.output, *part, replace=self.overwrite)
         say(f"merged {info.episodes:,} episodes, {info.frames:,} frames", f"dataset: {self.output}")
 
 

@@ -74,12 +74,12 @@ class RecordOptions(Varied, Seeded, Resumable):
                 check_same_options(journals, self)
             for folder, kind in kinds.items():
                 prepare_output(folder, kind, resume=self.resume, overwrite=self.overwrite)
-            self._record(job, root, journals, repo_id)
+            self._record(job, root, journals)
         say_next("train", f"--dataset.root={root}", f"--output_dir=runs/{root.name}")
         shape = [f"--task.object={env.object}"] if env.object else []
         say_next("view", f"--robot.type={env.robot}", f"--task.type={env.task}", *shape, what="to watch the expert")
 
-    def _record(self, job: RolloutJob, root: Path, journals: Path, repo_id: str) -> None:
+    def _record(self, job: RolloutJob, root: Path, journals: Path) -> None:
         from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance
         from manip_il.data.build import Recording
         from manip_il.data.journal import list_seeds
@@ -89,7 +89,7 @@ class RecordOptions(Varied, Seeded, Resumable):
         warn(*journal_of(journals, job).prepare())
         save_options(journals, self)
         video = asdict(VideoConfig(**self.dataset.rgb_encoder)) if job.cameras else {}
-        recording = Recording(repo_id, True, count, provenance(job), video)
+        recording = Recording(True, count, provenance(job), video)
         if list_seeds(journals):
             before, now = (one.provenance.get("vary") for one in (Recording.read(journals), recording))
             if before != now:

@@ -21,7 +21,7 @@ from manip_il.collect.environments import env_actions, env_fingerprint, env_spec
 from manip_il.collect.scenes import CHUNK, SceneDrawer, Scenes
 from manip_il.collect.workers import map_in_order
 from manip_il.data import schema
-from manip_il.data.build import dataset_sha256, local_id, rewrite_columns
+from manip_il.data.build import dataset_sha256, rewrite_columns
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset, Own
 from manip_il.data.episodes import to_episode
 from manip_il.data.fingerprint import compare_fingerprints
@@ -194,9 +194,8 @@ def _write[T](
         if empty:
             raise NothingToLearnError("no scene has a valid expert label, so there is nothing to learn from")
 
-    about: dict[str, Any] = {"repo_id": local_id(target.root.name), "fingerprint": fingerprint}
     with closing(map_in_order(work, pieces, target.workers)) as made:
-        return write_dataset(episodes(), target.root, spec, provenance, replace=target.replace, **about)
+        return write_dataset(episodes(), target.root, spec, provenance, replace=target.replace, fingerprint=fingerprint)
 
 
 def label_states(env: EnvConfig, states: NDArray[Any]) -> Columns:

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import itertools
 import logging
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -45,7 +44,6 @@ class Recording:
     drove, stored in the dataset. video: fields of `VideoConfig`.
     """
 
-    repo_id: str
     only_successes: bool = False
     episodes: int | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -62,9 +60,11 @@ class Recording:
         """Return the settings in `recording.json`; if it is missing, settings that keep every episode."""
         path = journals / RECORDING
         if not path.is_file():
-            return cls(local_id(journals.absolute().name.removesuffix(".journals") or "journals"))
+            return cls()
         with reading(path):
-            return cls(**checks.read_json(path, "the settings of a recording"))
+            settings = checks.read_json(path, "the settings of a recording")
+            settings.pop("repo_id", None)  # which nothing read
+            return cls(**settings)
 
     def make(self, rollouts: Rollouts, root: Path, *, replace: bool = False) -> tuple[Info, int]:
         """Write rollouts as a dataset; return its info and the number of failed episodes left out.
@@ -116,7 +116,7 @@ class Recording:
             provenance.update(seeds=[seeds[0], seeds[-1]], tried=len(seeds))
 
         video = VideoConfig(**self.video)
-        options: dict[str, Any] = {"repo_id": self.repo_id, "fingerprint": about.fingerprint, "video": video}
+        options: dict[str, Any] = {"fingerprint": about.fingerprint, "video": video}
         return write_dataset(selected(), root, about.spec, provenance, replace=replace, **options), failed
 
     def _is_full(self, episodes: int, labels: int) -> bool:
@@ -129,12 +129,6 @@ def _first_labels(episode: Episode, most: int) -> Episode:
     valid = episode.columns[LABEL_VALID].astype(np.int64)
     kept = valid * (np.cumsum(valid).reshape(valid.shape) <= most)
     return dataclasses.replace(episode, columns=episode.columns | {LABEL_VALID: kept})
-
-
-def local_id(folder: str) -> str:
-    """Return the repository id, `local/NAME`, for a folder's name, which may have any characters."""
-    name = re.sub(r"\.{2,}", ".", re.sub(r"[^A-Za-z0-9_.\-]+", "_", folder)).lstrip(".")
-    return f"local/{name[: checks.LONGEST_NAME] or 'dataset'}"
 
 
 def build(journals: Path, root: Path, *, replace: bool = False) -> tuple[Info, int]:
@@ -155,7 +149,6 @@ def merge_datasets(
     episodes: Sequence[str] = (),
     renamed: Mapping[str, str] | None = None,
     *,
-    repo_id: str,
     provenance: Mapping[str, Any] | None = None,
     replace: bool = False,
 ) -> Info:
@@ -168,7 +161,6 @@ def merge_datasets(
     Args:
         roots: The datasets.
         root: The new one.
-        repo_id: Its id, if a dataset is ours.
         provenance: Its origin, if a dataset is ours.
         replace: As in `new_folder`.
         episodes: Episodes to keep, as in `choose_episodes`, numbered as in the merged datasets; by default all.
@@ -192,7 +184,7 @@ def merge_datasets(
         for key, feature in table.items():
             if features.setdefault(key, feature)["dtype"] == "image":  # encoded if others have films
                 features[key] = feature
-    about = opened[0].fps, opened[0].info.robot or None, own, repo_id
+    about = opened[0].fps, opened[0].info.robot or None, own
     before, tables = 0, opened[0].other_tables
     with new_dataset(root, features, *about, tables=tables, replace=replace) as writer:
         for dataset in opened:
@@ -239,7 +231,7 @@ def rewrite_columns(
         features: Its columns; those that `columns` lack are the source's.
         replace: As in `new_folder`.
     """
-    about = dataset.fps, dataset.info.robot or None, own, local_id(target.name)
+    about = dataset.fps, dataset.info.robot or None, own
     with new_dataset(target, features, *about, tables=dataset.other_tables, replace=replace) as writer:
         for one, fresh in zip(dataset.stored_episodes(), columns, strict=True):
             writer.add_columns({**one.columns, **fresh}, one.tasks, one.others, one)

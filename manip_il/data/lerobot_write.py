@@ -45,7 +45,6 @@ def write_dataset(
     spec: RobotTaskSpec,
     provenance: Mapping[str, Any] | None = None,
     *,
-    repo_id: str,
     fingerprint: Mapping[str, Any],
     video: VideoConfig = VideoConfig(),  # noqa: B008  # frozen
     replace: bool = False,
@@ -58,9 +57,9 @@ def write_dataset(
     Also raises `MismatchError` for an episode with other columns than `features(spec)`, and `ManipError` if there are
     no episodes or the disk is full.
     """
-    about = Own(spec, fingerprint, {} if provenance is None else provenance), repo_id
+    own = Own(spec, fingerprint, {} if provenance is None else provenance)
     robot, table = spec.robot_type or spec.robot, features(spec)
-    with new_dataset(root, table, spec.fps, robot, *about, video=video, replace=replace) as writer:
+    with new_dataset(root, table, spec.fps, robot, own, video=video, replace=replace) as writer:
         for episode in episodes:
             columns = episode.columns
             if table.keys() != columns.keys():
@@ -78,7 +77,6 @@ def new_dataset(
     fps: float,
     robot_type: str | None,
     own: Own | None = None,
-    repo_id: str = "",
     *,
     video: VideoConfig = VideoConfig(),  # noqa: B008  # frozen
     tables: Iterable[Path] = (),
@@ -92,7 +90,6 @@ def new_dataset(
         fps: Frame rate [Hz].
         robot_type: LeRobot's name of the robot.
         own: Content of `meta/manip_il.json`, if it is a dataset of ours; read at the end.
-        repo_id: Its id, stored there.
         video: Settings of the encoder.
         tables: Other files of `meta/`, to be copied.
         replace: Replace a dataset of ours.
@@ -106,7 +103,8 @@ def new_dataset(
             with checks.native_path(path, "a table") as opened:
                 shutil.copyfile(opened, folder / "meta" / path.name)
         if own is not None:
-            ours = {"format": _FORMAT, "repo_id": repo_id, "spec": own.spec.to_json()}
+            name = f"local/{own.spec.robot}_{own.spec.task}"  # nothing reads it, but every version has written it
+            ours = {"format": _FORMAT, "repo_id": name, "spec": own.spec.to_json()}
             ours |= {"fingerprint": dict(own.fingerprint), "provenance": dict(own.provenance)}
             layout.write_json(folder / layout.OURS, ours)
 

@@ -44,7 +44,7 @@ class ServedEpisodes:
             before = Recording.read(self._journal.folder).provenance.get("driver", SERVED)
             if before != SERVED:
                 raise MismatchError("who drives", str(self._journal.folder), before, "this session", SERVED)
-            Recording(f"local/{config.name}", provenance={"driver": SERVED}).write(self._journal.folder)
+            Recording(provenance={"driver": SERVED}).write(self._journal.folder)
         there = set(list_seeds(folder)) if folder is not None else set[int]()
         self._seeds = (one for one in stream_seeds("demonstrations", BLOCK, seed) if one not in there)
         self.renew()

@@ -21,7 +21,7 @@ SPEC = RobotTaskSpec("r", "t", 20, ("a", "b"), ("ee.x",), 3, "do it")
 def dataset(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("mcap") / "d"
     episodes = [make_episode(SPEC, seed, 4) for seed in range(2)]
-    write_dataset(episodes, root, SPEC, repo_id="local/d", fingerprint={})
+    write_dataset(episodes, root, SPEC, fingerprint={})
     return root
 
 

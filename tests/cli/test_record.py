@@ -98,7 +98,7 @@ ENV = make_config("panda", "reach", horizon=6, success_steps=1)
 @pytest.fixture
 def demos(here) -> Path:
     episodes = RolloutJob(ENV).run(range(3))
-    write_dataset(episodes, Path("demos"), env_spec(ENV), repo_id="local/demos", fingerprint=env_fingerprint(ENV))
+    write_dataset(episodes, Path("demos"), env_spec(ENV), fingerprint=env_fingerprint(ENV))
     return Path("demos")
 
 

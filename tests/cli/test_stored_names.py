@@ -71,7 +71,6 @@ def given_files(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         base / "data",
         env_spec(ENV),
         {"driver": "expert"},
-        repo_id="local/data",
         fingerprint=env_fingerprint(ENV),
     )
     make_policy(base / "policy", ENV)

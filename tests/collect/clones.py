@@ -18,6 +18,6 @@ def clone(env: EnvConfig, episodes: int, folder: Path, *, steps: int, width: int
     from manip_il.learn.train import Trainer
 
     runs = RolloutJob(env, hold=3).run(stream_seeds("demonstrations", episodes))
-    write_dataset(runs, folder / "dataset", env_spec(env), repo_id="local/clone", fingerprint={})
+    write_dataset(runs, folder / "dataset", env_spec(env), fingerprint={})
     config = FitConfig({"width": width}, steps=steps, batch_size=batch_size)
     return Trainer((Dataset.open(folder / "dataset"),), config, folder).fit()

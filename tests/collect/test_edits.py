@@ -59,7 +59,7 @@ def write(
     episodes: list[Episode], root: Path, env: EnvConfig, cameras: CameraConfig | None = None, **provenance
 ) -> Path:
     about = {"fingerprint": env_fingerprint(env, cameras), "provenance": {"round": 3, **provenance}}
-    write_dataset(episodes, root, env_spec(env, cameras), repo_id=f"local/{root.name}", **about)
+    write_dataset(episodes, root, env_spec(env, cameras), **about)
     return root
 
 

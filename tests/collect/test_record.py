@@ -92,7 +92,7 @@ def test_journals_of_another_environment_are_not_gone_on_with(tmp_path):
 def test_a_dataset_recorded_as_it_goes_is_the_one_built_later(tmp_path):
     failing = [SEEDS[1]]
     folder = tmp_path / "journals"
-    rule = Recording("local/x", only_successes=True, episodes=3, provenance={"driver": "expert"})
+    rule = Recording(only_successes=True, episodes=3, provenance={"driver": "expert"})
     episodes = collect_successes(Recorded(failing), JOB, SEEDS, 3, folder)
     rule.write(folder)
     info, failed = rule.make(episodes, tmp_path / "dataset")

@@ -25,7 +25,7 @@ from ..pictures import assert_comes_back, write
 
 FINGERPRINT = {"mujoco": "3.11.0"}
 HERE = Path(__file__).parent
-OPTIONS: dict[str, Any] = {"repo_id": "someone/lift", "fingerprint": FINGERPRINT}
+OPTIONS: dict[str, Any] = {"fingerprint": FINGERPRINT}
 ORIGIN = {"recorded": 3, "failed": 1}
 
 
@@ -86,7 +86,7 @@ def test_a_merge_equals_writing_all_episodes(tmp_path, make_episode, spec):
     write_dataset(episodes[:4], tmp_path / "a", spec, provenance={"recorded": 4}, **OPTIONS)
     write_dataset(episodes[4:], tmp_path / "b", spec, **OPTIONS)
     write_dataset(episodes, tmp_path / "direct", spec, **OPTIONS)
-    info = merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "merged", repo_id="someone/lift")
+    info = merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "merged")
     assert info.episodes == 6
     merged, direct = digests(tmp_path / "merged"), digests(tmp_path / "direct")
     assert merged.pop(layout.OURS) != direct.pop(layout.OURS)  # where the episodes came from
@@ -103,13 +103,13 @@ def test_a_merge_of_different_robots_tasks_or_pictures_is_refused_naming_both(ro
         MismatchError,
         match=rf"{what} differs: .*lift has {re.escape(str(getattr(spec, what)))}, .*other has {re.escape(str(value))}",
     ):
-        merge_datasets([root, tmp_path / "other"], tmp_path / "merged", repo_id="x/y")
+        merge_datasets([root, tmp_path / "other"], tmp_path / "merged")
     assert not (tmp_path / "merged").exists()
 
 
 def test_a_merge_warns_of_different_environments(root, tmp_path, episodes, spec, caplog):
-    write_dataset(episodes, tmp_path / "old", spec, repo_id="x/y", fingerprint={"mujoco": "3.10.0"})
-    merge_datasets([root, tmp_path / "old"], tmp_path / "merged", repo_id="x/y")
+    write_dataset(episodes, tmp_path / "old", spec, fingerprint={"mujoco": "3.10.0"})
+    merge_datasets([root, tmp_path / "old"], tmp_path / "merged")
     assert "mujoco differs" in caplog.text
     assert "3.10.0" in caplog.text
 

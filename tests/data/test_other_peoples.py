@@ -284,5 +284,5 @@ def test_a_camera_is_renamed_where_it_has_another_name(root, recorded, tmp_path)
 def test_what_a_merge_cannot_keep_is_refused_by_name(root, recorded, tmp_path, change, what):
     edit_json(root / layout.INFO, change)
     with pytest.raises(MismatchError, match=what):
-        merge_datasets([root, recorded], tmp_path / "both", repo_id="a/b")
+        merge_datasets([root, recorded], tmp_path / "both")
     assert not (tmp_path / "both").exists()

@@ -73,7 +73,7 @@ def test_parts_are_the_rollout_cut_behind_every_done(rollout):
 def test_a_dataset_has_what_the_recording_says_and_is_built_again_to_the_byte(
     changes, expected, rollout, spec, tmp_path
 ):
-    recording = replace(Recording("local/d"), **changes)
+    recording = replace(Recording(), **changes)
     root = recorded([rollout(7), rollout(8)], spec, tmp_path, recording)
     assert labels(root) == expected
     sound = Dataset.open(root).columns([s.LABEL_VALID])[s.LABEL_VALID]
@@ -87,5 +87,5 @@ def test_rollouts_without_a_label_make_no_dataset(make_episode, spec, tmp_path):
     episode = make_episode(7)
     unasked = replace(episode, columns=episode.columns | {s.LABEL_VALID: np.zeros((len(episode), 1), np.int64)})
     with pytest.raises(NothingToLearnError, match="the expert was never queried"):
-        recorded([unasked], spec, tmp_path, Recording("local/d", only_labelled=True))
+        recorded([unasked], spec, tmp_path, Recording(only_labelled=True))
     assert not (tmp_path / "d").exists()

@@ -37,7 +37,7 @@ def seen(episodes) -> list[Episode]:
 
 @pytest.fixture
 def root(tmp_path: Path, seen, pictured) -> Path:
-    write_dataset(seen, tmp_path / "stills", pictured, repo_id="local/stills", fingerprint={})
+    write_dataset(seen, tmp_path / "stills", pictured, fingerprint={})
     return tmp_path / "stills"
 
 
@@ -54,7 +54,7 @@ def test_pictures_come_back_bit_for_bit(root, seen, pictured):
 def test_merged_with_films_they_become_films(root, seen, pictured, tmp_path):
     films = write(seen, tmp_path / "films", replace(pictured, video=True))
     for name, sources in (("a", [root, films]), ("b", [films, root])):
-        merge_datasets(sources, tmp_path / name, repo_id="local/both")
+        merge_datasets(sources, tmp_path / name)
         assert examine_folder(tmp_path / name) == []
         frames = Dataset.open(films).frames(FRONT, np.arange(20))
         np.testing.assert_array_equal(Dataset.open(tmp_path / name).frames(FRONT, np.arange(40)), [*frames, *frames])

@@ -111,7 +111,7 @@ def test_an_encoder_makes_no_thread_a_real_time_one():
 
 
 def test_datasets_with_cameras_become_one_with_the_same_pictures(tmp_path, root):
-    info = merge_datasets([root, root], tmp_path / "merged", repo_id="x/y", provenance={"made": "here"})
+    info = merge_datasets([root, root], tmp_path / "merged", provenance={"made": "here"})
     assert (info.episodes, info.frames) == (6, 42)
     assert not has_errors(examine_folder(tmp_path / "merged"))
     assert Dataset.open(tmp_path / "merged").spec == Dataset.open(root).spec

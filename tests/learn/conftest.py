@@ -89,7 +89,7 @@ def write_table(table: Mapping[str, np.ndarray], root: Path, spec: RobotTaskSpec
                 values = table[key][rows] if key in table else np.zeros(shape)
                 columns[key] = values.reshape(shape).astype(feature["dtype"])
         episodes.append(Episode(int(number), columns, success=True, success_at_end=True))
-    write_dataset(episodes, root, spec, repo_id=f"local/{root.name}", fingerprint={"mujoco": "3.11"})
+    write_dataset(episodes, root, spec, fingerprint={"mujoco": "3.11"})
     return (Dataset.open(root),)
 
 

@@ -40,7 +40,7 @@ FEATURES: dict[str, dict[str, Any]] = {
 @pytest.fixture(scope="module")
 def ours(tmp_path_factory: pytest.TempPathFactory, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
     root = tmp_path_factory.mktemp("ours") / "d"
-    write_dataset(episodes, root, spec, repo_id="local/d", fingerprint={})
+    write_dataset(episodes, root, spec, fingerprint={})
     return root
 
 

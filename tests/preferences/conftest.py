@@ -40,7 +40,7 @@ def datasets(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode
 
 
 def write(root: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> None:
-    write_dataset(episodes, root, spec, repo_id="someone/lift", fingerprint={})
+    write_dataset(episodes, root, spec, fingerprint={})
 
 
 @pytest.fixture(scope="session")
