@@ -159,7 +159,7 @@ def check_frames(dataset: Dataset) -> Iterator[Finding]:
 
 
 def check_own(dataset: Dataset) -> Iterator[Finding]:
-    """Check our own columns and `meta/manip_il.json`: names, shapes, labels, drivers, seeds."""
+    """Check our own columns and `meta/manip_il.json`: names and shapes."""
     own, features = dataset.own, dataset.features
     if own is None:
         if {s.SIM_STATE, s.EXECUTED_ACTION} <= features.keys():
@@ -171,12 +171,6 @@ def check_own(dataset: Dataset) -> Iterator[Finding]:
     for key, wanted in {**ours, "fps": own.spec.fps}.items():
         if (found := there.get(key, "missing")) != wanted:
             yield Finding(layout.OURS, f"{key} is {str(wanted)[:80]}, but {layout.INFO} has {str(found)[:80]}")
-    valid, actor, seed = (dataset.columns([key])[key].reshape(-1) for key in (s.LABEL_VALID, s.ACTOR, s.SEED))
-    first = seed[np.repeat(dataset.episodes.start, dataset.episodes.length)]
-    right = {s.LABEL_VALID: (valid, valid.clip(0, 1)), s.ACTOR: (actor, actor.clip(0, 2)), s.SEED: (seed, first)}
-    for key, (found, wanted) in right.items():
-        if text := _differ(found, wanted):
-            yield Finding(f"data: {key}", text)
 
 
 CHECKS = (check_leftovers, check_info, check_rows, check_numbers, check_frames, check_own)

@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 Rows = dict[int, slice]  # episode -> its rows
 _GRIPPER = re.compile(r"grip|finger|jaw|hand|claw", re.IGNORECASE)
 _STILL = 0.01  # a joint is still if it moves by less than this share of its range within a second
-_IDLE, _CLIPPED = 0.1, 0.05  # tolerated shares of the frames
+_IDLE = 0.1  # tolerated share of the frames
 _LEAD = 0.4  # tolerated lead of actions over the joints that follow them [s]
 _LEAST = 10  # least number of episodes for comparisons between them
 # checked episodes, pictures of each, thumbnail size [pixels]
@@ -54,7 +54,7 @@ def check_motions(dataset: Dataset) -> Iterator[Finding]:
         arm = ~gripper if gripper.any() else np.arange(len(names)) < len(names) - 1
         yield from _check_lag(dataset, rows, action[:, arm], state[:, arm])
         yield from _check_joints(dataset, rows, action[:, arm], state[:, arm], names[arm])
-        yield from _check_commands(rows, action, state, names, arm)
+        yield from _check_commands(action, state, names)
 
 
 def _check_idle(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
@@ -132,13 +132,12 @@ def _find_apart(values: F64, least: float) -> Mask:
     return (above if 2 * above.sum() <= len(values) else ~above) & (gap > max(5 * extent, least))
 
 
-def _check_commands(rows: Rows, action: F64, state: F64, names: NDArray[np.str_], arm: Mask) -> Iterator[Finding]:
-    """Find commands that are never reached, mostly of the gripper, and arm commands that are clipped at a limit.
+def _check_commands(action: F64, state: F64, names: NDArray[np.str_]) -> Iterator[Finding]:
+    """Find commands that are never reached, mostly of the gripper.
 
-    A joint that moves by a small share of its command but correlates with it has other units: no finding. An episode
-    that starts or ends at a limit does not count as clipped.
+    A joint that moves by a small share of its command but correlates with it has other units: no finding.
     """
-    for name, told, found, is_arm in zip(names, action.T, state.T, arm, strict=True):
+    for name, told, found in zip(names, action.T, state.T, strict=True):
         (low, high), (below, above) = np.quantile(told, [0.01, 0.99]), np.quantile(found, [0.01, 0.99])
         share = (above - below) / max(high - low, 1e-9)
         stuck = share < 0.05 and abs(_correlate(told, found)) < 0.5
@@ -146,12 +145,6 @@ def _check_commands(rows: Rows, action: F64, state: F64, names: NDArray[np.str_]
         if high - low > 1e-6 and (stuck or inside):
             text = f"{name} is commanded {low:.3g} to {high:.3g}, but only moves from {below:.3g} to {above:.3g}"
             yield warning(s.ACTION, text, f"calibrate or free that joint: {_AGAIN}")
-        for limit in {told.min(), told.max()} if is_arm and len(np.unique(told)) > 50 else ():
-            at = [told[span] == limit for span in rows.values()]
-            share = sum(int(one.sum()) for one in at if not one[0] and not one[-1]) / len(told)
-            if share > _CLIPPED:
-                text = f"{name} is clipped at {limit:.6g} in {share:.0%} of the frames"
-                yield warning(s.ACTION, text, f"widen that limit: {_AGAIN}")
 
 
 def check_cameras(dataset: Dataset) -> Iterator[Finding]:

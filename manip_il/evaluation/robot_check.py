@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -25,7 +24,7 @@ from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
-from manip_il.sim.config import FILM
+from manip_il.sim.config import CAMERAS, FILM
 from manip_il.sim.render import framed_picture
 from manip_il.sim.scene import PREFIX
 from manip_il.sim.world import Scene, World
@@ -253,26 +252,16 @@ def _at_home(scene: Scene) -> mujoco.MjData:
 
 
 def looks(name: NameOrPath) -> Figure:
-    """Draw a robot in its home pose, with the axes of its frame `ee`: from outside, and what two cameras see.
+    """Draw a robot in its home pose, with the axes of its frame `ee`, as its cameras see it.
 
     Raises `RenderError` without off-screen OpenGL.
     """
     scene = scene_of(name, "reach")
     data = _at_home(scene)
-    (x, y), half = scene.robot.workspace.centre, scene.robot.workspace.half_width
-    corners = [np.array([x + a * half, y + b * half, 0.001]) for a, b in _SQUARE]
-    points = np.vstack([data.xpos[1:], corners])
-    low, high = points.min(axis=0), points.max(axis=0)
-    outside = mujoco.MjvCamera()
-    outside.lookat[:] = (low + high) / 2
-    outside.azimuth = 55.0
-    outside.elevation = -20.0
-    outside.distance = 0.6 * float(np.linalg.norm(high - low)) / math.sin(math.radians(22.5))
     data.mocap_pos[:, 2] = -9.0  # move goals out of sight
-    views = {"from outside": outside, "what camera front sees": "front", "what camera wrist sees": "wrist"}
-    with drawing(len(views), size=_VIEW) as (drawn, axes):
-        for axis, (words, view) in zip(axes[0], views.items(), strict=True):
-            axis.imshow(framed_picture(scene, data, view, (480, 640), FILM))
-            axis.set_title(words)
+    with drawing(len(CAMERAS), size=_VIEW) as (drawn, axes):
+        for axis, camera in zip(axes[0], CAMERAS, strict=True):
+            axis.imshow(framed_picture(scene, data, camera, (480, 640), FILM))
+            axis.set_title(f"camera {camera}")
             axis.axis("off")
         return to_figure(drawn, "The arm at home in its scene")

@@ -56,10 +56,8 @@ def projections(scene: Scene, cameras: CameraConfig, points: F64) -> dict[str, F
     return {name: renderer.project(name, points, cameras.width / cameras.height) for name in cameras.names}
 
 
-def framed_picture(
-    scene: Scene, data: mujoco.MjData, camera: str | mujoco.MjvCamera, size: tuple[int, int], look: Look
-) -> Picture:
-    """Return what `camera`, the scene's or a free one, sees of the physics in `data`, with the axes of `ee` drawn in.
+def framed_picture(scene: Scene, data: mujoco.MjData, camera: str, size: tuple[int, int], look: Look) -> Picture:
+    """Return what a camera sees of the physics in `data`, with the axes of `ee` drawn in.
 
     The x axis is red, y green, z blue. size: height and width [pixels]. The picture is RGB, uint8 (height, width, 3).
     Raises `RenderError` as `pictures` does.
@@ -132,17 +130,15 @@ class _Renderer:
         mujoco.mj_camlight(self._model, self._data)
         self._props = props(self._of, self._data, part(variation, "clutter"))
 
-    def picture(self, camera: str | mujoco.MjvCamera, size: tuple[int, int], *, axes: bool = False) -> Picture:
+    def picture(self, camera: str, size: tuple[int, int], *, axes: bool = False) -> Picture:
         height, width = (_FINER * side for side in size)
         have = self._context.offHeight, self._context.offWidth
         if height > have[0] or width > have[1]:  # pictures of all sizes share one buffer
             mujoco.mjr_resizeOffscreen(max(width, have[1]), max(height, have[0]), self._context)
-        if isinstance(camera, str):
-            self._camera.fixedcamid = self._cameras[camera]
-            camera = self._camera
+        self._camera.fixedcamid = self._cameras[camera]
         everything, frame = mujoco.mjtCatBit.mjCAT_ALL, mujoco.mjtFrame
         self._option.frame, self._option.sitegroup[_EE] = (frame.mjFRAME_SITE if axes else frame.mjFRAME_NONE), axes
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, camera, everything, self._scene)
+        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._camera, everything, self._scene)
         for prop in self._props:
             prop.add_to(self._scene)
         fine = np.empty((height, width, 3), dtype=np.uint8)

@@ -122,12 +122,8 @@ def tasks(root: Path, rng: Rng) -> str:
 def own(root: Path, rng: Rng) -> str | None:
     if not (root / layout.OURS).exists():
         return None
-    key = str(rng.choice([s.LABEL_VALID, s.ACTOR, s.SEED, "spec"]))
-    if key == "spec":
-        edit_json(root / layout.OURS, lambda ours: ours["spec"]["joint_names"].__setitem__(0, "other"))
-        return "meta/manip_il.json: .*, but meta/info.json has"
-    edit_table(root / DATA, lambda table: table[key].__setitem__(9, 77))
-    return f"data: {key}: 77 at 9"
+    edit_json(root / layout.OURS, lambda ours: ours["spec"]["joint_names"].__setitem__(0, "other"))
+    return "meta/manip_il.json: .*, but meta/info.json has"
 
 
 def idle(root: Path, rng: Rng) -> str:
@@ -180,20 +176,14 @@ def joint(root: Path, rng: Rng) -> str:
 
 
 def commands(root: Path, rng: Rng) -> str:
-    """A gripper that does not follow, or clipped actions."""
-    what = str(rng.choice(["but only moves", "is clipped"]))
-    place, follows = int(rng.integers(4)), float(rng.choice([0.0, 0.4]))
-    low, high = np.quantile(Dataset.open(root).columns([s.ACTION])[s.ACTION][:, place], [0.3, 0.7])
+    """A gripper that does not follow."""
+    follows = float(rng.choice([0.0, 0.4]))
 
     def change(state: np.ndarray, action: np.ndarray) -> None:
-        if what == "but only moves":
-            state[:, 4] = 0.04 + (state[:, 4] - 0.04) * follows
-        else:
-            limits: Any = (low, None) if action[0, place] > low else (None, high)
-            action[:, place] = action[:, place].clip(*limits)
+        state[:, 4] = 0.04 + (state[:, 4] - 0.04) * follows
 
     move(root, change)
-    return f"action: .*{what}"
+    return "action: .*but only moves"
 
 
 def wraps(root: Path, rng: Rng) -> str:
