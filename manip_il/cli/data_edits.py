@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from manip_il.checks import parse_yaml, shorten
 from manip_il.cli.common_options import SMALL, Pictured, Varied
 from manip_il.cli.options import Given, given
-from manip_il.cli.outputs import Replacing, require_writable
-from manip_il.cli.progress import progress, say, warn
-from manip_il.data.atomic import exclusive
-from manip_il.data.ownership import DATASET
+from manip_il.cli.outputs import Replacing
 from manip_il.errors import UsageError
-from manip_il.evaluation.suites import varied
 from manip_il.option import NameOrPath, Seeded, option
 from manip_il.sim.config import CameraConfig, Look
-
-if TYPE_CHECKING:
-    from manip_il.collect.edits import EditSource, EditTarget
 
 _EXAMPLE = '{"observation.images.top": "observation.images.front"}'
 _RUN = "dataset"  # folder of a DAgger run with the states of all rounds
@@ -37,16 +29,6 @@ class BuildOptions(Replacing):
     example: ClassVar[str] = "manip-il data build datasets/demos.journals datasets/demos"
     journals: Path = option(MISSING, "folder of episode-*.mcap files", positional=True, exists="")
     dataset: Path = option(MISSING, "folder of the new dataset", positional=True)
-
-    def run(self) -> None:
-        """Build the dataset."""
-        from manip_il.data.build import build
-
-        require_writable(self.dataset, DATASET, self.overwrite, [self.journals])
-        with exclusive(self.dataset):
-            info, failed = build(self.journals, self.dataset, replace=self.overwrite)
-        say(f"built {info.episodes:,} episodes, {info.frames:,} frames; failed episodes left out: {failed}")
-        say(f"dataset: {self.dataset}")
 
 
 class RenameMap(dict[str, str]):
@@ -83,16 +65,6 @@ class MergeOptions(Replacing):
         flag="rename_map",
     )
 
-    def run(self) -> None:
-        """Merge; the new dataset appears when it is complete."""
-        from manip_il.data.build import merge_datasets
-
-        with exclusive(self.output):
-            require_writable(self.output, DATASET, self.overwrite, self.datasets)
-            part = self.episodes, self.renamed
-            info = merge_datasets(self.datasets, self.output, *part, replace=self.overwrite)
-        say(f"merged {info.episodes:,} episodes, {info.frames:,} frames", f"dataset: {self.output}")
-
 
 @dataclass(frozen=True)
 class Edit(Replacing):
@@ -109,26 +81,6 @@ class Edit(Replacing):
     )
     workers: int | None = option(None, "number of processes; by default one per core", at_least=1)
 
-    @contextmanager
-    def open(
-        self, what: str, root: Path | None = None, pieces: int | None = None
-    ) -> Generator[tuple[EditSource, EditTarget]]:
-        """Yield the dataset to read and the new dataset's locked folder, and show progress.
-
-        root: the dataset, by default `source`. pieces: total of the progress bar, by default the number of episodes.
-        """
-        from manip_il.collect.edits import EditTarget, open_source
-        from manip_il.collect.workers import default_workers
-
-        root = root or self.source
-        folder = self.target or root.with_name(f"{root.absolute().name}_{what}")
-        require_writable(folder, DATASET, self.overwrite, [root])
-        source = open_source(root, self.robot, self.task, self.object)
-        warn(*source.warnings)
-        with exclusive(folder), progress(pieces or source.dataset.info.episodes, str(folder)) as bar:
-            yield source, EditTarget(folder, self.workers or default_workers(), self.overwrite, bar.step)
-        say(f"dataset: {folder}")
-
 
 @dataclass(frozen=True)
 class RenderOptions(Edit, Pictured):
@@ -136,14 +88,6 @@ class RenderOptions(Edit, Pictured):
 
     example: ClassVar[str] = "manip-il data render datasets/demos datasets/dim --cameras=front --look.brightness=0.6"
     look: Look = field(default_factory=Look)
-
-    def run(self) -> None:
-        """Render every episode; TARGET appears when it is complete."""
-        from manip_il.collect.edits import render_dataset
-
-        with self.open("rendered") as (source, target):
-            info = render_dataset(source, self.camera_config(source.env, self.look), target)
-            say(f"rendered {info.episodes:,} episodes, {info.frames:,} frames")
 
 
 @dataclass(frozen=True)
@@ -156,14 +100,6 @@ class RelabelOptions(Edit):
     """
 
     example: ClassVar[str] = "manip-il data relabel datasets/demos"
-
-    def run(self) -> None:
-        """Label every state; TARGET appears when it is complete."""
-        from manip_il.collect.edits import relabel_dataset
-
-        with self.open("relabelled") as (source, target):
-            changed, info = relabel_dataset(source, target), source.dataset.info
-            say(f"relabelled {info.episodes:,} episodes, {info.frames:,} frames: {changed:,} labels differ")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,20 +119,3 @@ class RedrawOptions(Edit, Varied, Seeded):
         1, "control steps that the expert drives from every scene; more than 1 for act and diffusion", at_least=1
     )
     image: Given = given(CameraConfig, **SMALL)
-
-    def run(self) -> None:
-        """Draw all scenes; TARGET appears when it is complete."""
-        from manip_il.collect.edits import redraw_dataset
-        from manip_il.collect.scenes import CHUNK, Scenes
-        from manip_il.tasks.stock.envs import check_cameras
-
-        root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
-        with self.open("redrawn", root, -(-self.frames // CHUNK)) as (source, target):
-            conditions = varied(self.vary, source.env, sees=True)
-            cameras = self.camera_config(source.env)
-            check_cameras(source.env.robot, cameras)  # also if only states are written
-            cameras = cameras if self.pictures else None
-            scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
-            info = redraw_dataset(source, scenes, target)
-            left = self.frames - info.episodes
-            say(f"redrew {info.episodes:,} scenes, {info.frames:,} frames; {left:,} left out, without a valid label")

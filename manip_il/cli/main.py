@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import re
 import select
 import sys
 import traceback
@@ -26,7 +27,11 @@ EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 
 
 class Command(NamedTuple):
-    """A command. target: `module:OptionsClass` in `manip_il.cli`, imported when the command runs."""
+    """A command.
+
+    target: `module:OptionsClass` in `manip_il.cli`; its function is in the module of `manip_il.cli.run` with the
+    same name or, so that it imports only what it needs, in the one that a third part names.
+    """
 
     target: str
     summary: str
@@ -43,7 +48,7 @@ COMMANDS = {
     "serve": Command("serve:ServeOptions", "run a virtual SO-101 for LeRobot's own programs"),
     "push": Command("transfer:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
     "pull": Command("transfer:PullOptions", "download a dataset or policy and verify every file"),
-    "export": Command("transfer:ExportOptions", "export a policy as ONNX"),
+    "export": Command("transfer:ExportOptions:export", "export a policy as ONNX"),
     "theory": Command("theory:TheoryOptions", "compare the proven bounds of cloning and DAgger with a run"),
     "data check": Command("data_check:CheckOptions", "find errors in any LeRobot dataset"),
     "data repair": Command("data_check:RepairOptions", "repair a dataset, from its journals or its own data"),
@@ -52,16 +57,16 @@ COMMANDS = {
     "data relabel": Command("data_edits:RelabelOptions", "relabel a dataset with the current expert"),
     "data build": Command("data_edits:BuildOptions", "rebuild a dataset from its journals"),
     "data merge": Command("data_edits:MergeOptions", "merge datasets of one robot and task"),
-    "data score": Command("data_check:ScoreOptions", "score a dataset's episodes by a reward, to find bad ones"),
-    "data to-mcap": Command("transfer:McapExportOptions", "convert a dataset to MCAP files, for Foxglove etc."),
-    "data from-mcap": Command("transfer:McapImportOptions", "convert MCAP files to a dataset with a mapping file"),
+    "data score": Command("data_check:ScoreOptions:score", "score a dataset's episodes by a reward, to find bad ones"),
+    "data to-mcap": Command("transfer:McapExportOptions:mcap", "convert a dataset to MCAP files, for Foxglove etc."),
+    "data from-mcap": Command("transfer:McapImportOptions:mcap", "convert MCAP files to a dataset with a mapping file"),
     "robot new": Command("robot:RobotNewOptions", "write a first YAML file for an arm's MJCF"),
     "robot check": Command("robot:RobotCheckOptions", "measure what an arm can do, before recording"),
     "robot certify": Command("robot:CertifyOptions", "measure from which states the expert recovers"),
     "rl gail": Command("learning:GailOptions", "imitate by GAIL: reinforcement learning from demonstrations"),
     "rl airl": Command("learning:AirlOptions", "imitate by AIRL, which also learns a reward"),
     "rl ppo": Command("learning:PpoOptions", "improve a cloned policy with a reward learnt from preferences"),
-    "reward irl": Command("reward:IrlOptions", "learn a reward from demonstrations of the task carry"),
+    "reward irl": Command("reward:IrlOptions:irl", "learn a reward from demonstrations of the task carry"),
     "reward pairs": Command("reward:PairsOptions", "choose pairs of clips to compare"),
     "reward ask": Command("reward:AskOptions", "make a page that asks which clip is better"),
     "reward answer": Command("reward:AnswerOptions", "let a simulated teacher answer pairs by true progress"),
@@ -98,8 +103,16 @@ def load(name: str) -> type:
     """Return the dataclass of a command's options; `UnknownName` lists the known commands."""
     if name not in COMMANDS:
         raise UnknownName("command", name, COMMANDS)
-    module, _, options_class = COMMANDS[name].target.partition(":")
+    module, options_class, *_ = COMMANDS[name].target.split(":")
     return getattr(importlib.import_module(f"manip_il.cli.{module}"), options_class)
+
+
+def run(name: str, options: Any) -> None:
+    """Run a command with its options."""
+    module, options_class, *other = COMMANDS[name].target.split(":")
+    work = importlib.import_module(f"manip_il.cli.run.{(other or [module])[0]}")
+    command = re.sub(r"\B(?=[A-Z])", "_", options_class.removesuffix("Options")).lower()
+    getattr(work, f"run_{command}")(options)
 
 
 def _dispatch(own: list[str], others: list[str]) -> None:
@@ -117,7 +130,7 @@ def _dispatch(own: list[str], others: list[str]) -> None:
         options = parse(load(name), [*words, *others], command=name)
         check_paths(options)
         silence_ffmpeg_warning()
-        options.run()
+        run(name, options)
 
 
 def _report(error: BaseException, words: list[str]) -> int:

@@ -1,0 +1,176 @@
+"""Run `manip-il compare`: two policies or runs on the same seeds, or a study."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from manip_il import checks
+from manip_il.cli.common_options import EngineOptions, env_config
+from manip_il.cli.compare import CompareOptions, ComparisonOptions, StudyFile
+from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.inputs import check_policy
+from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, publish
+from manip_il.cli.parsing import from_layers, from_yaml
+from manip_il.cli.progress import Stages, say, warn
+from manip_il.cli.run.dagger import dagger_config, run_dagger
+from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.evaluation.comparison import FILE_NAME, Study
+from manip_il.evaluation.eval_report import compare_report
+from manip_il.evaluation.rounds import Rule
+from manip_il.evaluation.runner import Trial
+from manip_il.evaluation.side import Side, read_side, require_pair, require_same_env, select_rounds
+from manip_il.learn.checkpoint import Checkpoint
+from manip_il.seeding import stream_seeds
+from manip_il.tasks.config import EnvConfig
+
+_YAML = (".yaml", ".yml")
+_OF_STUDY = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study sets
+
+
+def run_compare(options: CompareOptions) -> None:
+    """Run the missing runs and evaluations, compare, print and write the result."""
+    match options.sides:
+        case [file] if file.suffix in _YAML:
+            _refuse(options, f"cannot be combined with a study; set them in {file}", "eval", "checkpoint", "at", "env")
+            _run_study(options, file)
+        case [left, right]:
+            _compare(options, left, right)
+        case _:
+            raise UsageError(f"{len(options.sides)} sides are given; expected two, or the YAML file of one study")
+
+
+def _refuse(options: CompareOptions, why: str, *names: str) -> None:
+    """Raise `UsageError` for options that have no effect, if they are given."""
+    plain = CompareOptions(sides=options.sides)
+    for name in names:
+        if getattr(options, name) != getattr(plain, name):
+            raise UsageError(f"options of {name} {why}")
+
+
+def _run_study(options: CompareOptions, path: Path) -> None:
+    plan = read_plan(path, options.training_seeds, options.trust)
+    file = plan.file
+    with options.output.open(file, path) as folder:
+        run_plan(plan, folder, options.engine)
+        rule, sides = select_rounds(
+            Rule(file.checkpoint, file.at), [read_side(folder / name, name) for name in plan.arms]
+        )
+        trials = _trials(options, sides, plan.envs, file.eval.n_episodes)
+        _report(options, sides, trials, folder, (plan.baseline, rule, file.target), f"Study: {path.stem}", file)
+
+
+def _compare(options: CompareOptions, left: Path, right: Path) -> None:
+    both = (read_side(left), read_side(right))
+    require_pair(*both)
+    rule, both = select_rounds(Rule(options.checkpoint, options.at), both)
+    first, *others = [member for side in both for member in side.members]
+    trials: Sequence[Trial] = ()
+    if first.result:
+        _refuse(options, "change nothing for two evaluations; give two policies", "eval", "env", "suite", "seed")
+        Study(both, both[0].name)  # raises unless they can be compared
+        for other in others:
+            warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
+    else:
+        envs = dict.fromkeys((side.name for side in both), _env(options, both))
+        trials = _trials(options, both, envs, options.eval.n_episodes)
+    with options.output.open(options) as folder:
+        _report(options, both, trials, folder, (both[0].name, rule), f"{left} against {right}", options)
+
+
+def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
+    """Return the test environment of all sides: that of the runs, else that of the policies."""
+    given = {name: value for name, value in options.env.items() if value is not None}
+    members = [member for side in sides for member in side.members]
+    if runs := [member for member in members if member.history]:
+        own = [given.pop(name, None) for name in ("robot", "task", "object")]
+        return require_same_env({run.name: replace(run.validation.env(*own), **given) for run in runs})
+    origins = {one.name: Checkpoint.open(one.policy).origin for one in members if one.policy is not None}
+    return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
+
+
+def _trials(
+    options: CompareOptions, sides: Sequence[Side], envs: Mapping[str, EnvConfig], n_episodes: int
+) -> list[Trial]:
+    """Return the test of each side; raises, before any episode runs, if a policy does not fit its environment."""
+    policies = list[Path]()
+    for side in sides:
+        for policy in side.policies:
+            check_policy(Checkpoint.open(policy), envs[side.name], trust=options.trust)
+            policies.append(policy)
+    seeds = stream_seeds("test", n_episodes, options.seed)
+    return [Trial.of(envs[side.name], seeds, options.suite, policies, options.trust) for side in sides]
+
+
+def _report(
+    options: CompareOptions,
+    sides: Sequence[Side],
+    trials: Sequence[Trial],
+    folder: Path,
+    how: tuple[Any, ...],
+    title: str,
+    config: ComparisonOptions,
+) -> None:
+    """Run the tests, write the result and the report, print the tables and the verdict.
+
+    trials: of each side; none if they are evaluations. how: what `Study` takes after its sides.
+    """
+    if trials:
+        with Stages(f"every finished episode, in {folder}") as stages, options.engine.open() as engine:
+            pairs = zip(sides, trials, strict=True)
+            sides = [side.measure(trial, folder, engine, stages) for side, trial in pairs]
+    study = Study(tuple(sides), *how)
+    page = compare_report(study, title, command_line(), to_plain(config))
+    publish(folder / FILE_NAME, study.to_json(), [study.table()], study.verdict, *study.facts, page=page)
+
+
+class StudyPlan(NamedTuple):
+    """A checked study: options and environment of every arm, and the arm to compare others with, if any."""
+
+    file: StudyFile
+    arms: Mapping[str, DaggerOptions]
+    envs: Mapping[str, EnvConfig]
+    baseline: str | None
+
+
+def run_plan(plan: StudyPlan, root: Path, engine: EngineOptions) -> None:
+    """Run the missing runs, seed by seed, so that a study that is stopped early has runs of every arm."""
+    runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
+    for number, (name, seed) in enumerate(runs, start=1):
+        output = ResumableOutput(root / name / f"seed_{seed}", resume=True)
+        if not (output.output_dir / REPORT_FILE).is_file():  # the file that a run writes last
+            say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
+            arm = plan.arms[name]
+            run_dagger(replace(arm, settings=arm.settings | {"seed": seed}, output=output, engine=engine))
+
+
+def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False) -> StudyPlan:
+    """Return the study in `path`; raises a one-line `UsageError` if something is invalid.
+
+    training_seeds: replaces the number in the file. trust: `--trust` for every run.
+    """
+    file = from_yaml(path, StudyFile)
+    file = replace(file, training_seeds=training_seeds or file.training_seeds)
+    if not file.arms:
+        raise UsageError(f"{path}: arms is empty; expected a mapping of names to options of manip-il dagger")
+    arms, envs = dict[str, DaggerOptions](), dict[str, EnvConfig]()
+    for name, own in file.arms.items():
+        try:
+            checks.name("its name, which becomes a folder,", name)
+            layers = [("common", file.common), ("its options", own)]
+            if found := next((one for one in _OF_STUDY for _, tree in layers if one in (tree or {})), None):
+                raise UsageError(f"{found} is set by the study for every run; remove it")
+            arms[name] = replace(from_layers(DaggerOptions, layers), trust=trust)
+            envs[name] = dagger_config(arms[name]).env
+        except ManipError as error:
+            raise UsageError(f"{path}: arm {name!r}: {error}") from error
+    if file.baseline is None and len({env.task for env in envs.values()}) > 1:
+        return StudyPlan(file, arms, envs, None)
+    require_same_env(envs)
+    if file.baseline is not None and file.baseline not in envs:
+        raise UnknownName("baseline", file.baseline, envs)
+    return StudyPlan(file, arms, envs, file.baseline or next(iter(envs)))

@@ -1,0 +1,83 @@
+"""Run `manip-il data render`, `redraw`, `relabel`, `build`, `merge`: make a dataset from existing ones."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+from manip_il.cli.data_edits import _RUN, BuildOptions, Edit, MergeOptions, RedrawOptions, RelabelOptions, RenderOptions
+from manip_il.cli.outputs import require_writable
+from manip_il.cli.progress import progress, say, warn
+from manip_il.collect.edits import EditSource, EditTarget, open_source, redraw_dataset, relabel_dataset, render_dataset
+from manip_il.collect.scenes import CHUNK, Scenes
+from manip_il.collect.workers import default_workers
+from manip_il.data.atomic import exclusive
+from manip_il.data.build import build, merge_datasets
+from manip_il.data.ownership import DATASET
+from manip_il.evaluation.suites import varied
+from manip_il.tasks.stock.envs import check_cameras
+
+
+def run_build(options: BuildOptions) -> None:
+    """Build the dataset."""
+    require_writable(options.dataset, DATASET, options.overwrite, [options.journals])
+    with exclusive(options.dataset):
+        info, failed = build(options.journals, options.dataset, replace=options.overwrite)
+    say(f"built {info.episodes:,} episodes, {info.frames:,} frames; failed episodes left out: {failed}")
+    say(f"dataset: {options.dataset}")
+
+
+def run_merge(options: MergeOptions) -> None:
+    """Merge; the new dataset appears when it is complete."""
+    with exclusive(options.output):
+        require_writable(options.output, DATASET, options.overwrite, options.datasets)
+        part = options.episodes, options.renamed
+        info = merge_datasets(options.datasets, options.output, *part, replace=options.overwrite)
+    say(f"merged {info.episodes:,} episodes, {info.frames:,} frames", f"dataset: {options.output}")
+
+
+@contextmanager
+def _open(
+    options: Edit, what: str, root: Path | None = None, pieces: int | None = None
+) -> Generator[tuple[EditSource, EditTarget]]:
+    """Yield the dataset to read and the new dataset's locked folder, and show progress.
+
+    root: the dataset, by default `source`. pieces: total of the progress bar, by default the number of episodes.
+    """
+    root = root or options.source
+    folder = options.target or root.with_name(f"{root.absolute().name}_{what}")
+    require_writable(folder, DATASET, options.overwrite, [root])
+    source = open_source(root, options.robot, options.task, options.object)
+    warn(*source.warnings)
+    with exclusive(folder), progress(pieces or source.dataset.info.episodes, str(folder)) as bar:
+        yield source, EditTarget(folder, options.workers or default_workers(), options.overwrite, bar.step)
+    say(f"dataset: {folder}")
+
+
+def run_render(options: RenderOptions) -> None:
+    """Render every episode; TARGET appears when it is complete."""
+    with _open(options, "rendered") as (source, target):
+        info = render_dataset(source, options.camera_config(source.env, options.look), target)
+        say(f"rendered {info.episodes:,} episodes, {info.frames:,} frames")
+
+
+def run_relabel(options: RelabelOptions) -> None:
+    """Label every state; TARGET appears when it is complete."""
+    with _open(options, "relabelled") as (source, target):
+        changed, info = relabel_dataset(source, target), source.dataset.info
+        say(f"relabelled {info.episodes:,} episodes, {info.frames:,} frames: {changed:,} labels differ")
+
+
+def run_redraw(options: RedrawOptions) -> None:
+    """Draw all scenes; TARGET appears when it is complete."""
+    root = options.source / _RUN if (options.source / _RUN / "meta" / "info.json").is_file() else options.source
+    with _open(options, "redrawn", root, -(-options.frames // CHUNK)) as (source, target):
+        conditions = varied(options.vary, source.env, sees=True)
+        cameras = options.camera_config(source.env)
+        check_cameras(source.env.robot, cameras)  # also if only states are written
+        cameras = cameras if options.pictures else None
+        scenes = Scenes(cameras, options.frames, options.seed, options.scenes, conditions, options.branch_steps)
+        info = redraw_dataset(source, scenes, target)
+        left = options.frames - info.episodes
+        say(f"redrew {info.episodes:,} scenes, {info.frames:,} frames; {left:,} left out, without a valid label")

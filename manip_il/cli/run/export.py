@@ -1,0 +1,26 @@
+"""Run `manip-il export`: a policy as one ONNX file."""
+
+from __future__ import annotations
+
+from manip_il.cli.progress import say
+from manip_il.cli.transfer import EXPORTABLE, ExportOptions
+from manip_il.data.atomic import write_file
+from manip_il.errors import ManipError
+from manip_il.evaluation.policy_folder import find_policy
+from manip_il.learn.checkpoint import read_config
+from manip_il.learn.export import export_onnx
+
+
+def run_export(options: ExportOptions) -> None:
+    """Export, compare, write."""
+    options.file.check()
+    path = find_policy(options.policy)
+    if (kind := read_config(path)["type"]) not in EXPORTABLE:
+        raise ManipError(f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported")
+    try:
+        content, difference = export_onnx(path)
+    except ImportError as error:
+        raise ManipError(f"an ONNX file needs {error.name}: pip install 'manip_il[export]'") from error
+    write_file(options.file.output, content)
+    say(f"largest difference from {path} over random observations: {difference:.1e}")
+    say(f"exported: {options.file.output} ({len(content):,} bytes)")

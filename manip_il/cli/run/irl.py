@@ -1,0 +1,24 @@
+"""Run `manip-il reward irl`: learn a reward from demonstrations."""
+
+from __future__ import annotations
+
+from manip_il.algorithms import inverse
+from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.outputs import publish
+from manip_il.cli.progress import progress, say_next
+from manip_il.cli.reward import IrlOptions
+from manip_il.rewards.methods import learn
+from manip_il.seeding import rng_for, stream_base
+
+
+def run_irl(options: IrlOptions) -> None:
+    """Read, learn, write the reward and the report, print the weights."""
+    with progress(None, f"irl {options.dataset}") as bar:
+        carried = inverse.read_carried(options.dataset, bar.step)
+    rng = rng_for(stream_base("training", options.seed), "irl")
+    learnt = learn(options.method, [one.demonstration for one in carried], rng)
+    found = inverse.Inverse(str(options.dataset), tuple(carried), learnt)
+    with options.output.open(options) as folder:
+        page = inverse.inverse_report(found, command_line(), to_plain(options))
+        publish(folder / inverse.FILE_NAME, found.to_json(), [inverse.weight_table(found)], page=page)
+    say_next("eval", "--policy.type=expert", f"--task.type=carry:{folder / inverse.FILE_NAME}")

@@ -1,0 +1,71 @@
+"""Run `manip-il rl gail`, `airl`, `ppo`: reinforcement learning from demonstrations or a learnt reward."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from manip_il.algorithms.learning_config import LearningConfig
+from manip_il.algorithms.results import Watch, learning_report, validations
+from manip_il.algorithms.run import Run
+from manip_il.cli.common_options import env_options
+from manip_il.cli.inputs import open_datasets
+from manip_il.cli.learning import GailOptions, Learning, PpoOptions
+from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.outputs import REPORT_FILE
+from manip_il.cli.progress import Stages, say, say_next
+from manip_il.collect.environments import env_spec
+from manip_il.data.json_lines import read_lines
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.evaluation.policy_folder import find_policy
+from manip_il.evaluation.rounds import METRICS_FILE
+from manip_il.learn.checkpoint import Origin
+from manip_il.learn.reward import LearnedReward
+from manip_il.tasks.config import stored_config
+
+
+def _run(options: Learning, config: LearningConfig) -> None:
+    """Run all iterations, or continue them, and write the report."""
+    with options.output.open(options) as folder:
+        kept = f"every finished iteration, in {folder}"
+        with Stages(kept) as stages, options.engine.open() as engine:
+            watch = Watch(on_episode=lambda _: stages.check(), on_step=stages.check)
+            stages.start(f"{options.method.upper()}, steps", config.steps)
+            for result in Run(config, folder, engine, watch).results():
+                stages.log({"step": result.steps} | result.metrics)
+                if result.validated is not None:
+                    say(f"{result.steps:,} steps: validation success {result.validated.success}")
+        title, found = f"{options.method.upper()} on {config.env.robot} {config.env.task}", validations(folder)
+        records, command = read_lines(folder / METRICS_FILE), command_line()
+        learning_report(title, found, records, command, to_plain(options)).write(folder / REPORT_FILE)
+    best = folder / "best" / "pretrained_model"
+    say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
+    say_next("eval", f"--policy.path={best}", *env_options(config.env), f"--output_dir={folder}/test")
+
+
+def _config(options: Learning, spec: RobotTaskSpec | Origin, **more: Any) -> LearningConfig:
+    """Return the configuration for the environment of `spec`; `UnknownName` if that is not built in."""
+    env = stored_config(spec)
+    start = None if options.init is None else find_policy(options.init)
+    return LearningConfig(method=options.method, env=env, ppo=options.ppo, start=start, **more, **options.settings)
+
+
+def run_gail(options: GailOptions) -> None:
+    """Imitate demonstrations by GAIL or AIRL."""
+    _run(options, imitation_config(options))
+
+
+run_airl = run_gail
+
+
+def run_ppo(options: PpoOptions) -> None:
+    """Improve a policy by PPO. Raises `MismatchError` if the reward does not fit the environment."""
+    reward = LearnedReward.load(found := find_policy(options.reward))
+    config = _config(options, reward.origin, reward=found)
+    reward.check_fits("the environment", env_spec(config.env))
+    _run(options, config)
+
+
+def imitation_config(options: GailOptions) -> LearningConfig:
+    """Return the configuration of the run; raises if the demonstrations are not of one known environment."""
+    first, *_ = open_datasets(options.dataset.root, pictures=False)
+    return _config(options, first.spec, datasets=tuple(options.dataset.root), discriminator=options.discriminator)

@@ -1,0 +1,36 @@
+"""Run `manip-il data to-mcap`, `from-mcap`: convert datasets."""
+
+from __future__ import annotations
+
+from manip_il.cli.outputs import kind_of_output, prepare_output, save_options
+from manip_il.cli.progress import progress, say, say_next
+from manip_il.cli.transfer import McapExportOptions, McapImportOptions
+from manip_il.data.atomic import new_folder
+from manip_il.data.dataset import Dataset
+from manip_il.mcap.export import MAPPING, export_dataset, left_out
+from manip_il.mcap.importing import import_files, list_files
+from manip_il.mcap.mapping import load_mapping
+
+
+def run_mcap_export(options: McapExportOptions) -> None:
+    """Export every episode; the folder appears when it is complete."""
+    dataset = Dataset.open(options.dataset)
+    prepare_output(options.out, kind_of_output(options), overwrite=options.overwrite, sources=[options.dataset])
+    with new_folder(options.out) as folder, progress(dataset.info.episodes, "export") as bar:
+        for _ in export_dataset(dataset, folder):
+            bar.step()
+        save_options(folder, options)
+    if missing := left_out(dataset.info):
+        say(f"left out, because MCAP cannot hold them: {', '.join(missing)}")
+    say(f"exported {dataset.info.episodes:,} episodes to {options.out}")
+    say_next("data", "from-mcap", options.out, "DATASET", f"--mapping={options.out / MAPPING}", what="to convert back")
+
+
+def run_mcap_import(options: McapImportOptions) -> None:
+    """Import every file; the dataset appears when it is complete."""
+    paths, frames = list_files(options.source), 0
+    with progress(len(paths), "import") as bar:
+        for count in import_files(paths, options.dataset, load_mapping(options.mapping)):
+            bar.step()
+            frames += count
+    say(f"imported {len(paths):,} episodes, {frames:,} frames to {options.dataset}")

@@ -1,0 +1,77 @@
+"""Run `manip-il robot new`, `check`, `certify`."""
+
+from __future__ import annotations
+
+import os
+
+from manip_il import checks
+from manip_il.cli.common_options import env_config
+from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.outputs import OutputFile, publish
+from manip_il.cli.progress import progress, say, say_next
+from manip_il.cli.robot import PAGE, CertifyOptions, RobotCheckOptions, RobotNewOptions
+from manip_il.collect.workers import Engine
+from manip_il.data.atomic import write_file, write_json
+from manip_il.errors import ManipError, RenderError
+from manip_il.evaluation import robot_check
+from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
+from manip_il.evaluation.robot_check import advice, check_robot, verdict
+from manip_il.evaluation.tables import print_table
+from manip_il.robots.gripper import sweep
+from manip_il.robots.suggest import suggest, yaml_of
+from manip_il.robots.table import get_robot
+from manip_il.tasks import NAMES
+from manip_il.tasks.table import get_task
+
+
+def run_robot_new(options: RobotNewOptions) -> None:
+    """Write the YAML file, check the robot, print what is left to do. Raises `ManipError` if it can do no task."""
+    target = options.output or options.model.with_suffix(".yaml")
+    checks.name(f"the name of {target}, which becomes the robot's,", target.stem)
+    OutputFile(target, overwrite=options.overwrite).check()
+    paths = [os.path.relpath(path, target.parent) if path else "" for path in (options.model, options.gripper)]
+    found = suggest(options.model, options.gripper)
+    write_file(target, yaml_of(found, *paths).encode())
+    say(f"robot: {target}")
+    with Engine(None) as engine:
+        checked = check_robot(target, list(NAMES), 0, engine, lambda _: None)
+    say(verdict(checked), *(f"change: {line}" for line in advice(checked)))
+    if len(checked.failed) == len(NAMES):
+        raise ManipError(f"{target} cannot do any task yet; see above")
+    say_next("view", f"--robot.type={target}", "--task.type=pick_place", what="look at the robot")
+
+
+def run_robot_check(options: RobotCheckOptions) -> None:
+    """Measure, print the tables, write the report. Raises `ManipError` if a task cannot be done."""
+    sweep(get_robot(options.robot))  # raises, before anything is written, if the robot cannot be used
+    tasks = options.tasks or list(NAMES)
+    for task in tasks:
+        get_task(task)
+    with options.output.open(options) as folder:
+        with progress(2 * options.episodes * len(tasks), f"check {options.robot}") as bar, Engine(None) as engine:
+            found = robot_check.check_robot(options.robot, tasks, options.episodes, engine, lambda _: bar.step())
+        write_json(folder / robot_check.FILE_NAME, found.to_json())
+        try:
+            pictures, no_pictures = [robot_check.looks(options.robot)], ""
+        except RenderError as error:
+            pictures, no_pictures = [], str(error)
+        page = robot_check.check_report(found, pictures, no_pictures, command_line(), to_plain(options))
+        page.write(folder / PAGE)
+    print_table(robot_check.task_table(found))
+    say(robot_check.verdict(found), *(f"change: {line}" for line in robot_check.advice(found)))
+    say(f"page: {folder / PAGE}")
+    if found.failed:
+        names = ", ".join(task.name for task in found.failed)
+        raise ManipError(f"{options.robot} cannot do {len(found.failed)} of {len(tasks)} tasks: {names}; see above")
+
+
+def run_certify(options: CertifyOptions) -> None:
+    """Run the episodes, write `certificate.json`, print the tables."""
+    env = env_config(options.env)
+    with options.output.open(options) as folder:
+        count = count_episodes(env, options.cases)
+        with progress(count, f"certify {env.robot} {env.task}") as bar, options.engine.open() as engine:
+            certificate = certify(engine, env, options.cases, options.seed, lambda _: bar.step())
+        mu = certificate.mu
+        lines = () if mu is None else (f"u of Ross et al. (2011) is at least {mu} steps",)
+        publish(folder / FILE_NAME, certificate.to_json(), [certificate.table()], *lines)

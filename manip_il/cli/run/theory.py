@@ -1,0 +1,39 @@
+"""Run `manip-il theory`: the proven bounds of cloning and DAgger, on small MDPs and on the rounds of a run."""
+
+from __future__ import annotations
+
+from itertools import chain
+from pathlib import Path
+
+from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.outputs import publish
+from manip_il.cli.progress import progress
+from manip_il.cli.theory import TheoryOptions
+from manip_il.evaluation.certify import certify, count_episodes
+from manip_il.evaluation.side import read_member
+from manip_il.theory.bounds import curves
+from manip_il.theory.linear import drifts
+from manip_il.theory.processes import PROCESSES
+from manip_il.theory.report import FILE_NAME, Theory, slope_table, theory_report
+from manip_il.theory.shift import Shift, find_rounds, measure_shift
+
+
+def run_theory(options: TheoryOptions) -> None:
+    """Compute and measure; write the report and the JSON file; print the slopes."""
+    with options.output.open(options) as folder:
+        shift = _shift(options, options.source) if options.source else None
+        theory = Theory(tuple(chain(*map(curves, PROCESSES))), tuple(drifts()), shift)
+        page = theory_report(theory, command_line(), to_plain(options))
+        fact = f"policies above their bound: {theory.above}"
+        publish(folder / FILE_NAME, theory.to_json(), [slope_table(theory)], fact, page=page)
+
+
+def _shift(options: TheoryOptions, run: Path) -> Shift:
+    rounds = find_rounds(run)
+    validation = read_member(run).validation
+    env = validation.env()
+    count = count_episodes(env, options.cases) + options.episodes * (1 + len(rounds))
+    with progress(count, f"theory {run}") as bar, options.engine.open() as engine:
+        certificate = certify(engine, env, options.cases, on_episode=lambda _: bar.step())
+        u, conditions = certificate.mu or 0, validation.settings.conditions
+        return measure_shift(engine, env, rounds, u, options.episodes, lambda _: bar.step(), conditions)

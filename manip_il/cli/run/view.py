@@ -1,0 +1,65 @@
+"""Run `manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun if there is no display."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from dataclasses import replace
+
+from manip_il.cli.common_options import default_cameras
+from manip_il.cli.inputs import open_driver
+from manip_il.cli.progress import say
+from manip_il.cli.view import IN_A_FILE, SIZE, ViewOptions
+from manip_il.collect.environments import make_env
+from manip_il.collect.job import RolloutJob, observed_cameras, run_steps
+from manip_il.collect.rollout import Environment
+from manip_il.errors import UsageError
+from manip_il.evaluation.runner import HOLD
+from manip_il.evaluation.suites import suite_conditions
+from manip_il.evaluation.watch import RerunLog, WindowScreen, outcome
+from manip_il.mdp import LONGEST_EPISODE
+from manip_il.seeding import BLOCK, stream_seeds
+from manip_il.sim.config import FILM, CameraConfig, Look
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.window import has_display
+from manip_il.tasks.config import EnvConfig
+from manip_il.tasks.stock.table import ROBOTS as STOCK
+
+
+def run_view(options: ViewOptions) -> None:
+    """Run episodes and show them."""
+    in_window, sliders = options.output is None and has_display(), options.policy.type == "sliders"
+    env, driver, cameras = open_driver(
+        options.policy.path, options.policy.type or "expert", options.env, trust=options.trust
+    )
+    in_window = in_window and env.robot not in STOCK
+    if sliders and not in_window:
+        raise UsageError(
+            "--policy.type=sliders opens a window: set DISPLAY and omit --output; not for fetch_stock and aloha"
+        )
+    if cameras is None and not in_window:  # for people to watch; shadows only in files, which may take longer
+        cameras = CameraConfig(default_cameras(env), **SIZE, look=FILM if options.output else Look())
+    if sliders and not options.env.get("horizon"):
+        env = replace(env, horizon=LONGEST_EPISODE)  # people are slower than the expert
+    conditions = suite_conditions(options.suite, env, sees=in_window or cameras is not None)
+    job = RolloutJob(env, driver, HOLD, conditions=conditions, cameras=cameras)
+    world = make_env(env, observed_cameras(job), conditions)
+    seeds = stream_seeds("validation", options.n_episodes or (IN_A_FILE if options.output else BLOCK), options.seed)
+    with contextlib.closing(_screen(options, world, env, in_window)) as screen:
+        for step in run_steps(job, [world], seeds, screen.act):
+            if not screen.add(step):
+                break
+            if step.done:
+                say(outcome(step))
+    if options.output is not None:
+        say(f"next: rerun {options.output}")
+
+
+def _screen(options: ViewOptions, env: Environment, config: EnvConfig, in_window: bool) -> WindowScreen | RerunLog:
+    if in_window and isinstance(env, ManipEnv):
+        return WindowScreen(env, sliders=options.policy.type == "sliders")
+    log = RerunLog(config, options.output)
+    if log.address:
+        ports = " ".join(f"-L {port}:localhost:{port}" for port in log.ports)
+        say(f"open: {log.address}", f"from another machine first: ssh {ports} {socket.gethostname()}")
+    return log
