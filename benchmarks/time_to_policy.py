@@ -28,6 +28,7 @@ from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.run import Run
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.parsing import from_yaml
+from manip_il.cli.run.dagger import dagger_config
 from manip_il.collect.workers import Engine, default_workers
 
 HERE = Path(__file__).parent
@@ -50,7 +51,7 @@ def main() -> int:
         limit = found["seconds"]
         print(f"imitation: {found['success']:.1%} from {found['labels']:,} labels after {limit:.1f} s", flush=True)
     given = from_yaml(HERE.parent / "configs" / "fetch_5cm.yaml", DaggerOptions)
-    config = replace(given, settings=given.settings | {"seed": options.seed}).config()
+    config = dagger_config(replace(given, settings=given.settings | {"seed": options.seed}))
     if options.quick:
         few = {"demonstrations": 4, "rounds": 1, "episodes_per_round": 4, "validation_episodes": 4, "refit_steps": 20}
         config = replace(config, **few, fit=replace(config.fit, steps=50))

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.cli.transfer import PushOptions
 
 
 @pytest.fixture
@@ -75,7 +74,7 @@ def test_a_traceback_of_any_error_is_cleaned(run, url, monkeypatch, capsys):
             "PUT https://store/x?X-Amz-Signature=0123456789abcdef with Authorization: Bearer hf_HunterTwo"
         )
 
-    monkeypatch.setattr(PushOptions, "run", fail)
+    monkeypatch.setattr("manip_il.cli.run.transfer.run_push", fail)
     assert main(["push", str(run), url, "--debug"]) == 1
     error = capsys.readouterr().err
     assert "RuntimeError: PUT https://store/x?X-Amz-Signature=[hidden]" in error

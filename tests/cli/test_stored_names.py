@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 import manip_il
 from manip_il.cli.main import load, main
 from manip_il.cli.parsing import parse
+from manip_il.cli.run.learning import imitation_config
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.data.lerobot_write import write_dataset
@@ -90,7 +91,7 @@ def relabel(base: Path) -> None:
 
 
 def adversary(base: Path) -> None:
-    parse(load("rl gail"), [f"--dataset.root={base / 'data'}"]).learning_config()  # pyright: ignore[reportAttributeAccessIssue]
+    imitation_config(parse(load("rl gail"), [f"--dataset.root={base / 'data'}"]))  # pyright: ignore[reportArgumentType]
 
 
 def evaluate(base: Path) -> None:
@@ -121,8 +122,8 @@ HOSTILE = (
     ),
     *("file://BASE/here/evil.py", "hf://here/evil", "panda", "so101.yaml", "reach", "mesh", "any", "box:0.05"),
 )
-VALUES = st.sampled_from(HOSTILE) | st.none() | st.booleans() | st.integers(-1, 3) | st.text(max_size=9)
-VALUES |= st.lists(VALUES, max_size=2) | st.dictionaries(st.text(max_size=5), VALUES, max_size=2)
+SINGLE = st.sampled_from(HOSTILE) | st.none() | st.booleans() | st.integers(-1, 3) | st.text(max_size=9)
+VALUES = SINGLE | st.lists(SINGLE, max_size=2) | st.dictionaries(st.text(max_size=5), SINGLE, max_size=2)
 
 
 def places(tree: Any) -> Iterator[tuple[Any, Any]]:

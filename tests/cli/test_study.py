@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.cli.compare import read_plan
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import main
+from manip_il.cli.run.compare import read_plan
 from manip_il.errors import MismatchError
 
 from .made_runs import make_run

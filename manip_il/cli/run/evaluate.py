@@ -7,8 +7,6 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from OpenGL import GL  # imported after mujoco has set PYOPENGL_PLATFORM
-
 from manip_il.cli.common_options import path_options
 from manip_il.cli.evaluate import EPISODES, MOST_EPISODES, NO_FILES, EvalOptions
 from manip_il.cli.inputs import open_driver
@@ -146,6 +144,7 @@ def machine() -> str:
     env = make_env()
     env.start(0)
     render.pictures(env.scene, env.data, CameraConfig(CAMERAS))
+    from OpenGL import GL  # imported after mujoco has set PYOPENGL_PLATFORM
 
     renderer = GL.glGetString(GL.GL_RENDERER) or b"unknown renderer"
     return f"{renderer.decode()}; cores {default_workers()}"
