@@ -85,7 +85,7 @@ class Scene:
 
     @cached_property
     def furniture(self) -> I64:
-        """The geoms of mocap bodies: goal markers and the fixed parts of the task."""
+        """The numbers of the geoms of mocap bodies, (g,): goal markers and the fixed parts of the task."""
         return np.flatnonzero(self.model.body_mocapid[self.model.body_rootid[self.model.geom_bodyid]] >= 0)
 
     @property
