@@ -30,19 +30,20 @@ class FakeOptions:
     dataset: Group = field(default_factory=Group)
     resume: bool = False
 
-    def run(self) -> None:
-        match self.act:
-            case "say":
-                say(f"episodes {self.dataset.num_episodes}")
-            case "fail":
-                raise ManipError("the work\nfailed")
-            case "usage":
-                raise UsageError("0 episodes; expected 1 or more")
-            case "bug":
-                raise ZeroDivisionError("by\nzero")
-            case "stop":
-                with Stages("1 of 50 episodes in x") as stages:
-                    os.kill(os.getpid(), signal.SIGTERM)
-                    stages.check()
-            case "interrupt":
-                raise KeyboardInterrupt
+
+def run_fake(options: FakeOptions) -> None:
+    match options.act:
+        case "say":
+            say(f"episodes {options.dataset.num_episodes}")
+        case "fail":
+            raise ManipError("the work\nfailed")
+        case "usage":
+            raise UsageError("0 episodes; expected 1 or more")
+        case "bug":
+            raise ZeroDivisionError("by\nzero")
+        case "stop":
+            with Stages("1 of 50 episodes in x") as stages:
+                os.kill(os.getpid(), signal.SIGTERM)
+                stages.check()
+        case "interrupt":
+            raise KeyboardInterrupt

@@ -13,7 +13,8 @@ from . import fake_command
 
 @pytest.fixture(autouse=True)
 def fake(monkeypatch):
-    monkeypatch.setitem(sys.modules, "manip_il.cli.fake_command", fake_command)
+    for package in ("manip_il.cli", "manip_il.cli.run"):
+        monkeypatch.setitem(sys.modules, f"{package}.fake_command", fake_command)
     monkeypatch.setitem(COMMANDS, "fake", Command("fake_command:FakeOptions", "do what the tests ask"))
 
 

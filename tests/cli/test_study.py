@@ -48,7 +48,7 @@ def runs(policy, monkeypatch) -> list[DaggerOptions]:
         successes = (0.2, 0.4, 0.6) if options.method == "dagger" else (0.2, 0.2, 0.4)
         make_run(options.output.output_dir, policy, options.settings["seed"], successes)
 
-    monkeypatch.setattr(DaggerOptions, "run", run)
+    monkeypatch.setattr("manip_il.cli.run.compare.run_dagger", run)
     return asked
 
 
