@@ -6,7 +6,7 @@ The results are the weights of a reward, `reward.json`, and the report of `manip
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -171,7 +171,7 @@ def open_line(found: Inverse) -> str:
     )
 
 
-def inverse_report(found: Inverse, command: str, config: Mapping[str, Any]) -> Report:
+def inverse_report(found: Inverse) -> Report:
     """Return the report of the learnt weights."""
     weights = Section(
         "What a metre costs",
@@ -190,8 +190,6 @@ def inverse_report(found: Inverse, command: str, config: Mapping[str, Any]) -> R
         title="Costs inferred from demonstrations",
         verdict=f"By the learnt weights, the {len(found.carried)} demonstrations cost {found.excess:.1%} more than the "
         "cheapest paths.",
-        command=command,
-        config=config,
         sections=(weights, costs),
     )
 

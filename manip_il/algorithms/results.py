@@ -112,13 +112,7 @@ def best_validation(found: dict[int, EvalResult]) -> int:
     return max(found, key=lambda number: (found[number].success.rate, number))
 
 
-def learning_report(
-    title: str,
-    found: dict[int, EvalResult],
-    records: Sequence[Mapping[str, Any]],
-    command: str,
-    config: Mapping[str, Any],
-) -> Report:
+def learning_report(title: str, found: dict[int, EvalResult], records: Sequence[Mapping[str, Any]]) -> Report:
     """Return the report of a run. found: validations by iteration, at least one. records: lines of metrics.jsonl."""
     best, names = best_validation(found), {number: f"iteration {number}" for number in found} | {0: "initial policy"}
     sides = {
@@ -133,7 +127,5 @@ def learning_report(
         title=title,
         verdict=f"Best {names[best]}: validation success {found[best].success}.",
         facts=tuple(facts),
-        command=command,
-        config=config,
         fingerprint=found[best].fingerprint,
     )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from manip_il.cli.options import options_of
+from manip_il.cli.options import command_line, options_of, to_plain
 from manip_il.cli.parsing import dump_yaml, from_yaml
 from manip_il.cli.progress import say
 from manip_il.data.atomic import clear, exclusive, write_file, write_json
@@ -149,16 +149,29 @@ def require_writable(folder: Path, kind: str, overwrite: bool, sources: Sequence
     require_replaceable(folder, kind if overwrite else "")
 
 
+def write_page(page: Report, path: Path, options: Any) -> None:
+    """Write a report, with the command line and the resolved options that made it."""
+    replace(page, command=command_line(), config=to_plain(options)).write(path)
+
+
 def publish(
-    path: Path, content: Mapping[str, Any], tables: Iterable[Table], *lines: str, page: Report | None = None
+    path: Path,
+    content: Mapping[str, Any],
+    tables: Iterable[Table],
+    *lines: str,
+    page: Report | None = None,
+    options: Any = None,
 ) -> None:
-    """Write a result as JSON, and its report beside it if there is one; print its tables, lines and files."""
+    """Write a result as JSON, and its report beside it if there is one; print its tables, lines and files.
+
+    options: as for `write_page`.
+    """
     from manip_il.evaluation.tables import print_table
 
     written = [f"result: {path}"]
     write_json(path, content)
     if page is not None:
-        page.write(path.with_name(REPORT_FILE))
+        write_page(page, path.with_name(REPORT_FILE), options)
         written.append(f"report: {path.with_name(REPORT_FILE)}")
     for table in tables:
         print_table(table)

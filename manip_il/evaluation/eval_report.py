@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,13 +17,7 @@ from manip_il.evaluation.tables import BASELINE, INTERVAL, Table
 from manip_il.tasks.stock import table as stock
 
 
-def eval_report(
-    result: EvalResult,
-    command: str,
-    config: Mapping[str, Any],
-    films: Sequence[Film] = (),
-    no_films: str = "",
-) -> Report:
+def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = "") -> Report:
     """Return the report of an evaluation. no_films: why there are no films, or empty."""
     settings, sides = result.settings, condition_sides(result)
     solved = f"an error of at most {100 * settings.tolerance:g} cm for {settings.success_steps} control steps in a row"
@@ -36,13 +30,11 @@ def eval_report(
     return Report(
         title=f"Evaluation of {result.policy}: {result.robot} {result.task}",
         verdict=evaluation_verdict(result),
-        command=command,
         sections=(
             _results(sides, success_table(sides), note, result),
             *_failures([Side.of("failed episodes", result)]),
             *_films(films, no_films),
         ),
-        config=config,
         fingerprint=result.fingerprint,
     )
 
@@ -59,7 +51,7 @@ def run_report(
     return Report(sections=(results, *_curves(runs), *_films(films, no_films)), **parts)
 
 
-def compare_report(study: Study, title: str, command: str, config: Mapping[str, Any]) -> Report:
+def compare_report(study: Study, title: str) -> Report:
     """Return the report of a comparison of sides."""
     others = [side.name for side in study.sides if side.name != study.baseline]
     colours = dict(zip(others, itertools.cycle(COLOURS), strict=False))
@@ -76,9 +68,7 @@ def compare_report(study: Study, title: str, command: str, config: Mapping[str, 
         title=f"{title}: {what}",
         verdict=study.verdict,
         facts=tuple(study.facts),
-        command=command,
         sections=(_results(sides, table, note, first), *failures, *curves),
-        config=config,
         fingerprint=first.fingerprint,
     )
 

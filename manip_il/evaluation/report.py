@@ -42,14 +42,14 @@ class Section:
 class Report:
     """A page: the verdict (a first sentence with numbers), further facts, sections, and how it was made.
 
-    command: the command that made it. config, fingerprint: nested mappings.
+    command, config: the command that made it, and its options, which it fills in. fingerprint: a nested mapping.
     """
 
     title: str
     verdict: str
-    command: str
     sections: tuple[Section, ...]
     facts: tuple[str, ...] = ()
+    command: str = ""
     config: Mapping[str, Any] = field(default_factory=dict[str, Any])
     fingerprint: Mapping[str, Any] = field(default_factory=dict[str, Any])
 

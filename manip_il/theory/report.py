@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,7 +65,7 @@ def slope_table(theory: Theory) -> Table:
     )
 
 
-def theory_report(theory: Theory, command: str, config: Mapping[str, Any]) -> Report:
+def theory_report(theory: Theory) -> Report:
     """Return the report of all results."""
     sections = [_theorems(theory), _linear(theory)]
     facts = [
@@ -82,8 +82,6 @@ def theory_report(theory: Theory, command: str, config: Mapping[str, Any]) -> Re
         f"of {slopes[walk, 'cloning']:.1f} and DAgger's to the power of {slopes[walk, 'DAgger']:.1f}; on a {rope} "
         f"both powers are {slopes[rope, 'DAgger']:.1f}.",
         facts=tuple(facts),
-        command=command,
-        config=config,
         sections=tuple(sections),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -24,10 +25,10 @@ PAIR = made_pair(often, seldom, seeds=2)
 def made_report() -> Report:
     """With conditions, films and settings."""
     films = [small_film(number) for number in range(3)]
-    return eval_report(RESULT, "manip-il eval --policy.path=runs/a", {"a": {"b": 1}}, films)
+    return replace(eval_report(RESULT, films), command="manip-il eval --policy.path=runs/a", config={"a": {"b": 1}})
 
 
-REPORTS = {"eval": made_report, "compare": lambda: compare_report(PAIR, "a against b", "manip-il compare a b", {})}
+REPORTS = {"eval": made_report, "compare": lambda: compare_report(PAIR, "a against b")}
 
 
 @pytest.fixture(scope="module")

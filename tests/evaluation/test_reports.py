@@ -18,7 +18,7 @@ COMMAND = "manip-il eval --policy.path=runs/a/best --suite=all"
 MP4 = b"\0\0\0\x18ftypisom" + b"\0" * 20
 FILMS = [Film("Seed 3", MP4), Film("Seed 4", MP4)]
 RESULT = made_eval()
-REPORT = eval_report(RESULT, COMMAND, {"eval": {"n_episodes": 120}}, FILMS)
+REPORT = replace(eval_report(RESULT, FILMS), command=COMMAND, config={"eval": {"n_episodes": 120}})
 SELDOM = made_pair(often, seldom)
 
 
@@ -54,7 +54,7 @@ def test_a_run_has_its_policies_their_curves_and_how_it_was_made():
 
 
 def test_a_comparison_tells_which_is_better_and_where_they_fail():
-    page = page_of(compare_report(SELDOM, "t", COMMAND, {}))
+    page = page_of(compare_report(SELDOM, "t"))
     assert SELDOM.verdict.startswith("runs/dagger is better than runs/cloning by ")
     assert "Every policy ran 120 test episodes on the same seeds" in page.text
     assert "phase that it ended in" in page.text
@@ -64,10 +64,15 @@ def test_a_comparison_tells_which_is_better_and_where_they_fail():
 def test_whatever_comes_from_outside_is_escaped():
     made = made_eval(EVIL, phases=(EVIL,), conditions=(EVIL, f"{EVIL}2"))
     evil = replace(made, robot=EVIL, task=EVIL, fingerprint={EVIL: EVIL})
-    assert page_of(eval_report(evil, EVIL, {EVIL: EVIL}, [Film(EVIL, MP4, EVIL)], EVIL)).text.count("alert") > 20
+    assert (
+        page_of(
+            replace(eval_report(evil, [Film(EVIL, MP4, EVIL)], EVIL), command=EVIL, config={EVIL: EVIL})
+        ).text.count("alert")
+        > 20
+    )
     sides = tuple(Side.of(f"{EVIL}{side}", evil) for side in "lr")
     study = replace(SELDOM, sides=sides, baseline=sides[0].name)
-    assert page_of(compare_report(study, EVIL, EVIL, {})).text.count("alert") > 10
+    assert page_of(compare_report(study, EVIL)).text.count("alert") > 10
 
 
 def test_a_figure_is_the_same_bytes_and_fits_a_phone():

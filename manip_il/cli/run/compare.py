@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from manip_il import checks
-from manip_il.cli.common_options import EngineOptions, env_config
+from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.compare import CompareOptions, ComparisonOptions, StudyFile
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.inputs import check_policy
-from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, publish
 from manip_il.cli.parsing import from_layers, from_yaml
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.cli.run.dagger import dagger_config, run_dagger
+from manip_il.cli.run.inputs import check_policy, env_config
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.evaluation.comparison import FILE_NAME, Study
@@ -124,8 +123,10 @@ def _report(
             pairs = zip(sides, trials, strict=True)
             sides = [side.measure(trial, folder, engine, stages) for side, trial in pairs]
     study = Study(tuple(sides), *how)
-    page = compare_report(study, title, command_line(), to_plain(config))
-    publish(folder / FILE_NAME, study.to_json(), [study.table()], study.verdict, *study.facts, page=page)
+    page = compare_report(study, title)
+    publish(
+        folder / FILE_NAME, study.to_json(), [study.table()], study.verdict, *study.facts, page=page, options=config
+    )
 
 
 class StudyPlan(NamedTuple):

@@ -8,12 +8,10 @@ from typing import Any
 from manip_il.algorithms.config import ALGORITHMS, RunConfig, check_labels
 from manip_il.algorithms.results import Result, best_result
 from manip_il.algorithms.run import Run
-from manip_il.cli.common_options import env_config, env_options
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.inputs import check_given, round_policy
-from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import REPORT_FILE
+from manip_il.cli.outputs import REPORT_FILE, write_page
 from manip_il.cli.progress import Stages, say, say_next
+from manip_il.cli.run.inputs import check_given, env_config, env_options, round_policy
 from manip_il.collect.environments import env_fingerprint
 from manip_il.collect.query import parse_query
 from manip_il.collect.workers import Engine
@@ -25,6 +23,7 @@ from manip_il.evaluation.suites import varied
 from manip_il.evaluation.tables import CLONING, DAGGER
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
+from manip_il.tasks.config import EnvConfig
 
 
 def run_dagger(options: DaggerOptions) -> None:
@@ -36,11 +35,16 @@ def run_dagger(options: DaggerOptions) -> None:
             engine.warm_up(learned=True)
             results = run_rounds(config, folder, engine, stages)
         _report(options, config, results, folder)
-    best = folder / "best" / "pretrained_model"
     if (folder / "dataset").is_dir():
         say(f"labels of all rounds as one dataset: {folder / 'dataset'}")
+    say_best(folder, config.env)
+
+
+def say_best(folder: Path, env: EnvConfig) -> None:
+    """Print where a run's report and best policy are, and how to evaluate that."""
+    best = folder / "best" / "pretrained_model"
     say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
-    say_next("eval", f"--policy.path={best}", *env_options(config.env), f"--output_dir={folder}/test")
+    say_next("eval", f"--policy.path={best}", *env_options(env), f"--output_dir={folder}/test")
 
 
 def dagger_config(options: DaggerOptions) -> RunConfig:
@@ -82,7 +86,8 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[Result], fo
         verdict = Comparison(sides[0], sides[best.number]).verdict
         facts = (f"{verdict} The best round was chosen on these episodes, so its success is biased up.",)
     chosen = f"{names[best.number]}, best of {len(results)}"
-    write_page(
+    write_run_page(
+        options,
         folder,
         folder,
         sides,
@@ -90,8 +95,6 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[Result], fo
         title=f"{kind} on {config.env.robot} {config.env.task}",
         verdict=f"{chosen}: {success} success on {success.n:,} validation episodes.",
         facts=facts,
-        command=command_line(),
-        config=to_plain(options),
     )
 
 
@@ -108,10 +111,10 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     return results
 
 
-def write_page(folder: Path, run: Path, sides: list[Side], kind: str, **parts: Any) -> None:
+def write_run_page(options: Any, folder: Path, run: Path, sides: list[Side], kind: str, **parts: Any) -> None:
     """Write to `folder` the report on the policies of `run`: their table, and curves of success over cost.
 
     kind: the algorithm's name. parts: see `run_report`.
     """
     page = run_report(sides, [Side(kind, (read_member(run),))], fingerprint=sides[-1].results[0].fingerprint, **parts)
-    page.write(folder / REPORT_FILE)
+    write_page(page, folder / REPORT_FILE, options)

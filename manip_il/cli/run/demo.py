@@ -10,13 +10,12 @@ from pathlib import Path
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.results import best_result
 from manip_il.algorithms.run import Run
-from manip_il.cli.common_options import env_options
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.demo import ENOUGH, DemoOptions
-from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE
 from manip_il.cli.progress import Stages, say, say_next
-from manip_il.cli.run.dagger import dagger_config, run_rounds, write_page
+from manip_il.cli.run.dagger import dagger_config, run_rounds, write_run_page
+from manip_il.cli.run.inputs import env_options
 from manip_il.collect.workers import Engine
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.eval_report import success_table
@@ -44,8 +43,8 @@ def run_demo(options: DemoOptions) -> None:
     )
     facts.append(f"{config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.")
     parts = {"title": f"Demo: {config.env.robot} {config.env.task}", "verdict": verdict, "facts": tuple(facts)}
-    parts |= {"films": films, "no_films": no_films, "command": command_line(), "config": to_plain(options)}
-    write_page(folder, folder / "dagger", sides, "DAgger", **parts)
+    parts |= {"films": films, "no_films": no_films}
+    write_run_page(options, folder, folder / "dagger", sides, "DAgger", **parts)
     print_table(success_table(sides))
     say(verdict, *facts)
     say(f"report: {folder / REPORT_FILE}")

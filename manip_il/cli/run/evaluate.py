@@ -7,12 +7,10 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from manip_il.cli.common_options import path_options
 from manip_il.cli.evaluate import EPISODES, MOST_EPISODES, NO_FILES, EvalOptions
-from manip_il.cli.inputs import open_driver
-from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import OutputFile, publish
 from manip_il.cli.progress import Stages, say, say_next, warn
+from manip_il.cli.run.inputs import open_driver, path_options
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import default_workers
@@ -81,8 +79,8 @@ def _report(
     options: EvalOptions, result: EvalResult, folder: Path, films: Sequence[Film] = (), no_films: str = ""
 ) -> None:
     """Write the result and its report, and print its tables."""
-    page = eval_report(result, command_line(), to_plain(options), films, no_films)
-    publish(folder / FILE_NAME, result.to_json(), [success_table(condition_sides(result))], page=page)
+    page = eval_report(result, films, no_films)
+    publish(folder / FILE_NAME, result.to_json(), [success_table(condition_sides(result))], page=page, options=options)
 
 
 def _merge(options: EvalOptions) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from manip_il.algorithms import inverse
-from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import publish
 from manip_il.cli.progress import progress, say_next
 from manip_il.cli.reward import IrlOptions
@@ -19,6 +18,6 @@ def run_irl(options: IrlOptions) -> None:
     learnt = learn(options.method, [one.demonstration for one in carried], rng)
     found = inverse.Inverse(str(options.dataset), tuple(carried), learnt)
     with options.output.open(options) as folder:
-        page = inverse.inverse_report(found, command_line(), to_plain(options))
-        publish(folder / inverse.FILE_NAME, found.to_json(), [inverse.weight_table(found)], page=page)
+        page = inverse.inverse_report(found)
+        publish(folder / inverse.FILE_NAME, found.to_json(), [inverse.weight_table(found)], page=page, options=options)
     say_next("eval", "--policy.type=expert", f"--task.type=carry:{folder / inverse.FILE_NAME}")

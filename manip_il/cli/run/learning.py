@@ -7,12 +7,11 @@ from typing import Any
 from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.algorithms.results import Watch, learning_report, validations
 from manip_il.algorithms.run import Run
-from manip_il.cli.common_options import env_options
-from manip_il.cli.inputs import open_datasets
 from manip_il.cli.learning import GailOptions, Learning, PpoOptions
-from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import REPORT_FILE
-from manip_il.cli.progress import Stages, say, say_next
+from manip_il.cli.outputs import REPORT_FILE, write_page
+from manip_il.cli.progress import Stages, say
+from manip_il.cli.run.dagger import say_best
+from manip_il.cli.run.inputs import open_datasets
 from manip_il.collect.environments import env_spec
 from manip_il.data.json_lines import read_lines
 from manip_il.data.schema import RobotTaskSpec
@@ -35,11 +34,9 @@ def _run(options: Learning, config: LearningConfig) -> None:
                 if result.validated is not None:
                     say(f"{result.steps:,} steps: validation success {result.validated.success}")
         title, found = f"{options.method.upper()} on {config.env.robot} {config.env.task}", validations(folder)
-        records, command = read_lines(folder / METRICS_FILE), command_line()
-        learning_report(title, found, records, command, to_plain(options)).write(folder / REPORT_FILE)
-    best = folder / "best" / "pretrained_model"
-    say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
-    say_next("eval", f"--policy.path={best}", *env_options(config.env), f"--output_dir={folder}/test")
+        page = learning_report(title, found, read_lines(folder / METRICS_FILE))
+        write_page(page, folder / REPORT_FILE, options)
+    say_best(folder, config.env)
 
 
 def _config(options: Learning, spec: RobotTaskSpec | Origin, **more: Any) -> LearningConfig:

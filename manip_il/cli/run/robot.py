@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 
 from manip_il import checks
-from manip_il.cli.common_options import env_config
-from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import OutputFile, publish
+from manip_il.cli.outputs import OutputFile, publish, write_page
 from manip_il.cli.progress import progress, say, say_next
 from manip_il.cli.robot import PAGE, CertifyOptions, RobotCheckOptions, RobotNewOptions
+from manip_il.cli.run.inputs import env_config
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_file, write_json
-from manip_il.errors import ManipError, RenderError
+from manip_il.errors import ManipError
 from manip_il.evaluation import robot_check
 from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
 from manip_il.evaluation.robot_check import advice, check_robot, verdict
@@ -51,12 +50,7 @@ def run_robot_check(options: RobotCheckOptions) -> None:
         with progress(2 * options.episodes * len(tasks), f"check {options.robot}") as bar, Engine(None) as engine:
             found = robot_check.check_robot(options.robot, tasks, options.episodes, engine, lambda _: bar.step())
         write_json(folder / robot_check.FILE_NAME, found.to_json())
-        try:
-            pictures, no_pictures = [robot_check.looks(options.robot)], ""
-        except RenderError as error:
-            pictures, no_pictures = [], str(error)
-        page = robot_check.check_report(found, pictures, no_pictures, command_line(), to_plain(options))
-        page.write(folder / PAGE)
+        write_page(robot_check.check_report(found), folder / PAGE, options)
     print_table(robot_check.task_table(found))
     say(robot_check.verdict(found), *(f"change: {line}" for line in robot_check.advice(found)))
     say(f"page: {folder / PAGE}")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from manip_il.cli.inputs import open_driver
 from manip_il.cli.outputs import kind_of_output, save_options
 from manip_il.cli.progress import say
+from manip_il.cli.run.inputs import open_driver
 from manip_il.cli.serve import _IDLE, SERVO, ServeOptions
 from manip_il.data.atomic import exclusive
 from manip_il.data.ownership import require_ours

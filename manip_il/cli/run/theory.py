@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import chain
 from pathlib import Path
 
-from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import publish
 from manip_il.cli.progress import progress
 from manip_il.cli.theory import TheoryOptions
@@ -23,9 +22,9 @@ def run_theory(options: TheoryOptions) -> None:
     with options.output.open(options) as folder:
         shift = _shift(options, options.source) if options.source else None
         theory = Theory(tuple(chain(*map(curves, PROCESSES))), tuple(drifts()), shift)
-        page = theory_report(theory, command_line(), to_plain(options))
+        page = theory_report(theory)
         fact = f"policies above their bound: {theory.above}"
-        publish(folder / FILE_NAME, theory.to_json(), [slope_table(theory)], fact, page=page)
+        publish(folder / FILE_NAME, theory.to_json(), [slope_table(theory)], fact, page=page, options=options)
 
 
 def _shift(options: TheoryOptions, run: Path) -> Shift:

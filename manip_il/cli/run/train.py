@@ -6,9 +6,8 @@ import contextlib
 import os
 from pathlib import Path
 
-from manip_il.cli.common_options import own_files, start_policy
-from manip_il.cli.inputs import open_datasets, why_not_simulated
 from manip_il.cli.progress import Stages, progress, say, say_next, set_quiet
+from manip_il.cli.run.inputs import open_datasets, own_files, start_policy, why_not_simulated
 from manip_il.cli.train import RANK, TrainOptions
 from manip_il.data.dataset import Dataset
 from manip_il.errors import UsageError

@@ -7,8 +7,8 @@ import socket
 from dataclasses import replace
 
 from manip_il.cli.common_options import default_cameras
-from manip_il.cli.inputs import open_driver
 from manip_il.cli.progress import say
+from manip_il.cli.run.inputs import open_driver
 from manip_il.cli.view import IN_A_FILE, SIZE, ViewOptions
 from manip_il.collect.environments import make_env
 from manip_il.collect.job import RolloutJob, observed_cameras, run_steps

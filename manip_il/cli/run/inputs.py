@@ -1,31 +1,88 @@
-"""Checks of the datasets and policies that a command is given.
-
-Commands import this module only when they run, because it imports the environment and the learner.
-"""
+"""What commands do with their inputs: the environment that is meant, and checks of datasets and policies."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from manip_il import checks
 from manip_il.algorithms.config import RunConfig
-from manip_il.cli.common_options import OF_POLICY, env_config, start_policy
+from manip_il.cli.common_options import OF_POLICY
 from manip_il.cli.options import Given, Open
 from manip_il.cli.progress import warn
 from manip_il.collect.drivers import Driver, PolicyDriver, driver_of
 from manip_il.collect.environments import env_fingerprint, env_spec, is_known
-from manip_il.data.dataset import Dataset
+from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import SIM_STATE, check_same_spec, features
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
-from manip_il.learn.checkpoint import Checkpoint
+from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.sources import check_same_sources
+from manip_il.robots.table import is_robot
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import EnvConfig, stored_config
+from manip_il.sim.shape import MESH
+from manip_il.tasks.config import EnvConfig, complete, stored_config
+from manip_il.tasks.stock import table as stock
+from manip_il.tasks.table import is_task
 
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
+
+
+def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
+    """Return the environment: each value as given, else as in the policy's checkpoint, else the default.
+
+    Raises `UnknownName` for an unknown robot or task, `UsageError` for any other invalid value.
+    """
+    values = {name: value for name, value in env.items() if value is not None}
+    if origin is not None:
+        if lacking := [one for one in own_files(origin.robot, origin.task) if one[2:].partition(".")[0] not in values]:
+            raise UsageError(
+                f"the policy is for {origin.robot} {origin.task}, of a file of your own; give {' '.join(lacking)}"
+            )
+        of_policy: dict[str, Any] = {"robot": origin.robot, "control_hz": origin.fps}
+        of_policy |= {} if origin.task == UNKNOWN_TASK else {"task": origin.task}
+        values = of_policy | values
+        if values.get("task") == origin.task:
+            values.setdefault("object", origin.object)
+    return complete(EnvConfig(**values))
+
+
+def own_files(robot: str, task: str, shape: str = "") -> list[str]:
+    """Return the options, with FILE for a path, that commands need for what a dataset or a policy only names.
+
+    robot, task, shape: as in a `RobotTaskSpec`.
+    """
+    if robot in stock.ROBOTS or task == UNKNOWN_TASK:
+        return []
+    robots = [] if is_robot(robot) else ["--robot.type=FILE.yaml"]
+    meshes = ["--task.object=mesh:FILE:LENGTH"] if shape.startswith(MESH) else []
+    return [*robots, *([] if is_task(task) else ["--task.type=FILE.py"]), *meshes]
+
+
+def env_options(env: EnvConfig) -> list[str]:
+    """Return those options of an environment that no dataset or policy stores: paths, and changed limits."""
+    try:
+        usual = complete(replace(env, tolerance=0.0, horizon=0, success_steps=0))
+    except ManipError:  # the user's file was edited or deleted meanwhile
+        usual = env
+    limits = [name for name in ("tolerance", "horizon", "success_steps") if getattr(env, name) != getattr(usual, name)]
+    return path_options(env) + [f"--env.{name}={getattr(env, name):g}" for name in limits]
+
+
+def path_options(env: EnvConfig) -> list[str]:
+    """Return the options that name files of the user's own, which no dataset, policy or result stores."""
+    named = {"--robot.type": env.robot, "--task.type": env.task, "--task.object": env.object}
+    return [f"{name}={path}" for name, path in named.items() if isinstance(path, Path)]
+
+
+def start_policy(settings: Open) -> Open:
+    """Return the `--policy.*` options of a fit, with `path` resolved to its `pretrained_model` folder."""
+    if "path" not in settings:
+        return settings
+    return settings | {"path": str(find_policy(Path(str(settings["path"])).expanduser()))}
 
 
 def round_policy(settings: Open) -> tuple[Open, Path | None]:
