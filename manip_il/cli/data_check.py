@@ -32,9 +32,6 @@ class RepairOptions(CheckOptions):
     example: ClassVar[str] = "manip-il data repair datasets/demos"
 
 
-PROGRESS = "progress"  # value of --reward: score by true progress
-
-
 @dataclass(frozen=True)
 class ScoreOptions(OfDataset):
     """Score every frame and episode of a dataset by a reward, and list the worst episodes.

@@ -16,7 +16,6 @@ from manip_il.option import NameOrPath, Seeded, option
 from manip_il.sim.config import CameraConfig, Look
 
 _EXAMPLE = '{"observation.images.top": "observation.images.front"}'
-_RUN = "dataset"  # folder of a DAgger run with the states of all rounds
 
 
 @dataclass(frozen=True)

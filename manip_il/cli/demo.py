@@ -15,7 +15,6 @@ from manip_il.option import option
 from manip_il.tasks.config import EnvConfig
 
 RUN: Given = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # replace the defaults of dagger
-ENOUGH = 1.25  # demonstrations to record, relative to the number that should give enough labels
 FIT: Given = {"steps": 3_000, "batch_size": 256}
 
 

@@ -12,9 +12,6 @@ from manip_il.cli.outputs import ResumableOutput
 from manip_il.option import Seeded, option
 from manip_il.tasks.config import EnvConfig
 
-EPISODES, MOST_EPISODES = 100, 10_000
-NO_FILES = ("expert", "random")  # drivers without a checkpoint
-
 
 @dataclass(frozen=True)
 class MeasuredPolicyGroup:

@@ -110,7 +110,7 @@ def load(name: str) -> type:
 def run(name: str, options: Any) -> None:
     """Run a command with its options."""
     module, options_class, *other = COMMANDS[name].target.split(":")
-    work = importlib.import_module(f"manip_il.cli.run.{(other or [module])[0]}")
+    work = importlib.import_module(f"manip_il.cli.run.{[*other, module][0]}")
     command = re.sub(r"\B(?=[A-Z])", "_", options_class.removesuffix("Options")).lower()
     getattr(work, f"run_{command}")(options)
 

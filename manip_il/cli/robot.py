@@ -13,8 +13,6 @@ from manip_il.option import NameOrPath, Seeded, option
 from manip_il.tasks import NAMES
 from manip_il.tasks.config import EnvConfig
 
-PAGE = "check.html"
-
 
 @dataclass(frozen=True)
 class RobotNewOptions(Replacing):

@@ -11,10 +11,6 @@ from manip_il.option import option
 from manip_il.serve.config import ServoConfig, SessionConfig
 from manip_il.tasks.config import EnvConfig
 
-SERVO = "servo"  # a value of --vary
-
-_IDLE = ("late", "random_actions", "dynamics")  # conditions that do not affect a served arm
-
 
 @dataclass(frozen=True)
 class ServeOptions(Varied, Trusting):

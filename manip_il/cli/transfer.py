@@ -48,9 +48,6 @@ class PullOptions(Replacing):
     dry_run: bool = option(False, "only list what would be downloaded")
 
 
-EXPORTABLE = ("mlp", "cnn")
-
-
 @dataclass(frozen=True)
 class ExportOptions:
     """Export an mlp or cnn policy as one file that runs without this package.

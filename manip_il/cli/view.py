@@ -12,7 +12,6 @@ from manip_il.option import Seeded, option
 from manip_il.tasks.config import EnvConfig
 
 IN_A_FILE = 3  # episodes written to a file by default
-SIZE = {"height": 240, "width": 320}  # picture size for people [pixels]
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from manip_il.cli.data_edits import _RUN, BuildOptions, Edit, MergeOptions, RedrawOptions, RelabelOptions, RenderOptions
+from manip_il.cli.data_edits import BuildOptions, Edit, MergeOptions, RedrawOptions, RelabelOptions, RenderOptions
 from manip_il.cli.outputs import require_writable
 from manip_il.cli.progress import progress, say, warn
 from manip_il.collect.edits import EditSource, EditTarget, open_source, redraw_dataset, relabel_dataset, render_dataset
@@ -17,6 +17,8 @@ from manip_il.data.build import build, merge_datasets
 from manip_il.data.ownership import DATASET
 from manip_il.evaluation.suites import varied
 from manip_il.tasks.stock.envs import check_cameras
+
+_RUN = "dataset"  # folder of a DAgger run with the states of all rounds
 
 
 def run_build(options: BuildOptions) -> None:

@@ -11,7 +11,7 @@ from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.results import best_result
 from manip_il.algorithms.run import Run
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.demo import ENOUGH, DemoOptions
+from manip_il.cli.demo import DemoOptions
 from manip_il.cli.outputs import REPORT_FILE
 from manip_il.cli.progress import Stages, say, say_next
 from manip_il.cli.run.dagger import dagger_config, run_rounds, write_run_page
@@ -25,6 +25,8 @@ from manip_il.evaluation.runner import Trial
 from manip_il.evaluation.side import Side
 from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT, print_table
 from manip_il.seeding import stream_seeds
+
+ENOUGH = 1.25  # demonstrations to record, relative to the number that should give enough labels
 
 
 def run_demo(options: DemoOptions) -> None:

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from manip_il.cli.evaluate import EPISODES, MOST_EPISODES, NO_FILES, EvalOptions
+from manip_il.cli.evaluate import EvalOptions
 from manip_il.cli.outputs import OutputFile, publish
 from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.cli.run.inputs import open_driver, path_options
@@ -29,6 +29,8 @@ from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, CameraConfig
 from manip_il.tasks.envs import make_env
 
+NO_FILES = ("expert", "random")  # drivers without a checkpoint
+
 
 def run_eval(options: EvalOptions) -> None:
     """Evaluate, write `eval.json` and `report.html`, print the table; or check, replay or merge."""
@@ -48,18 +50,18 @@ def run_eval(options: EvalOptions) -> None:
 
 
 def _evaluate(options: EvalOptions) -> None:
-    most = EPISODES if options.until_width is None else MOST_EPISODES
+    most = 100 if options.until_width is None else 10_000
     end = options.eval.first + (options.eval.n_episodes or most)
     seeds = stream_seeds(options.eval.stream, end, options.seed)[options.eval.first :]
     name, engine = str(options.policy.type or options.policy.path), options.engine.open()
     engine.warm_up(learned=options.policy.path is not None)  # meanwhile this process checks the policy
     job = _job(options)
-    suite = options.suite
-    width = options.until_width
     with options.output.open(options) as folder:
-        finished_episodes(folder, job, suite)  # raises if the folder has another policy's episodes
+        finished_episodes(folder, job, options.suite)  # raises if the folder has another policy's episodes
         with Stages(f"finished episodes, in {folder}") as stages, engine:
-            result = measure(engine, job, seeds, name, folder, stages, suite=suite, until_width=width)
+            result = measure(
+                engine, job, seeds, name, folder, stages, suite=options.suite, until_width=options.until_width
+            )
             films = film_outcomes(engine, job, result, options.eval.films, stages)
         _report(options, result, folder, *films)
     seed = next((one.seed for one in result.episodes if not one.success), result.episodes[0].seed)
@@ -68,11 +70,11 @@ def _evaluate(options: EvalOptions) -> None:
 
 
 def _job(options: EvalOptions) -> RolloutJob:
-    kind, device = options.policy.type or "expert", options.policy.device
-    env, driver, cameras = open_driver(options.policy.path, kind, options.env, trust=options.trust, device=device)
+    policy, kind = options.policy, options.policy.type or "expert"
+    env, driver, cameras = open_driver(policy.path, kind, options.env, trust=options.trust, device=policy.device)
     conditions = suite_conditions(options.suite, env, sees=cameras is not None)
-    hold, batch = episode_hold(env, options.eval.hold), options.eval.batch_size
-    return RolloutJob(env, driver, hold, label="last", conditions=conditions, batch=batch)
+    hold = episode_hold(env, options.eval.hold)
+    return RolloutJob(env, driver, hold, label="last", conditions=conditions, batch=options.eval.batch_size)
 
 
 def _report(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from manip_il.cli.progress import say
-from manip_il.cli.transfer import EXPORTABLE, ExportOptions
+from manip_il.cli.transfer import ExportOptions
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.checkpoint import read_config
 from manip_il.learn.export import export_onnx
+
+EXPORTABLE = ("mlp", "cnn")
 
 
 def run_export(options: ExportOptions) -> None:

@@ -7,7 +7,7 @@ import os
 from manip_il import checks
 from manip_il.cli.outputs import OutputFile, publish, write_page
 from manip_il.cli.progress import progress, say, say_next
-from manip_il.cli.robot import PAGE, CertifyOptions, RobotCheckOptions, RobotNewOptions
+from manip_il.cli.robot import CertifyOptions, RobotCheckOptions, RobotNewOptions
 from manip_il.cli.run.inputs import env_config
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_file, write_json
@@ -21,6 +21,8 @@ from manip_il.robots.suggest import suggest, yaml_of
 from manip_il.robots.table import get_robot
 from manip_il.tasks import NAMES
 from manip_il.tasks.table import get_task
+
+PAGE = "check.html"
 
 
 def run_robot_new(options: RobotNewOptions) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from manip_il.cli.outputs import kind_of_output, save_options
 from manip_il.cli.progress import say
 from manip_il.cli.run.inputs import open_driver
-from manip_il.cli.serve import _IDLE, SERVO, ServeOptions
+from manip_il.cli.serve import ServeOptions
 from manip_il.data.atomic import exclusive
 from manip_il.data.ownership import require_ours
 from manip_il.errors import UnknownName, UsageError
@@ -17,6 +17,10 @@ from manip_il.evaluation.suites import varied
 from manip_il.serve.config import LEADERS, SessionConfig
 from manip_il.serve.session import serve
 from manip_il.sim.window import has_display
+
+SERVO = "servo"  # a value of --vary
+
+_IDLE = ("late", "random_actions", "dynamics")  # conditions that do not affect a served arm
 
 
 def run_serve(options: ServeOptions) -> None:

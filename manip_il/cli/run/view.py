@@ -9,7 +9,7 @@ from dataclasses import replace
 from manip_il.cli.common_options import default_cameras
 from manip_il.cli.progress import say
 from manip_il.cli.run.inputs import open_driver
-from manip_il.cli.view import IN_A_FILE, SIZE, ViewOptions
+from manip_il.cli.view import IN_A_FILE, ViewOptions
 from manip_il.collect.environments import make_env
 from manip_il.collect.job import RolloutJob, observed_cameras, run_steps
 from manip_il.collect.rollout import Environment
@@ -24,6 +24,8 @@ from manip_il.sim.env import ManipEnv
 from manip_il.sim.window import has_display
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.stock.table import ROBOTS as STOCK
+
+SIZE = {"height": 240, "width": 320}  # picture size for people [pixels]
 
 
 def run_view(options: ViewOptions) -> None:
