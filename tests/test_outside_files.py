@@ -24,6 +24,7 @@ ALLOWED = {
     "learn/ppo.py": "the state of a run's own last checkpoint",
     "robots/files.py": "a user's model, after its included files were read",
     "serve/operator.py": "the kernel's file of this process",
+    "sim/scene.py": "the empty scene, which ships with the package",
     "tasks/stock/aloha/expert.py": "a model in an installed package",
     "tasks/table.py": "the source of code that runs already",
 }

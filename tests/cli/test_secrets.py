@@ -39,7 +39,7 @@ def _nowhere():
         raise RemoteError(f"cannot reach {url}, {url!r}")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("manip_il.store.transfer.open_remote", refuse)
+        patch.setattr("manip_il.cli.run.transfer.open_remote", refuse)
         yield
 
 
