@@ -29,14 +29,14 @@ from _machine import describe_machine
 from numpy.typing import NDArray
 from scipy.stats import trim_mean
 
-from manip_il.algorithms.airl import airl
-from manip_il.algorithms.gail import gail
-from manip_il.algorithms.vector_env import ActionRange, Lockstep
-from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
-from manip_il.learn.discriminators import Discriminator
+from manip_il.chapter.actor_critic import Learner, seed_generators
+from manip_il.chapter.adversarial_config import DiscriminatorConfig, PPOConfig
+from manip_il.chapter.airl import airl
+from manip_il.chapter.discriminators import Discriminator
+from manip_il.chapter.gail import gail
+from manip_il.chapter.transitions import Demonstrations, Transitions
+from manip_il.chapter.vector_env import ActionRange, Lockstep
 from manip_il.learn.network import MLPNetwork, Shape, fit_statistics, threads
-from manip_il.learn.ppo import Learner, seed_generators
-from manip_il.learn.transitions import Demonstrations, Transitions
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]

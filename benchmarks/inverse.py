@@ -23,14 +23,14 @@ import numpy as np
 from _machine import describe_machine
 from numpy.typing import NDArray
 
-from manip_il.algorithms.inverse import CARRY, read_carried
+from manip_il.chapter.inverse import CARRY, read_carried
+from manip_il.chapter.rewards.methods import METHODS, learn
 from manip_il.cli.main import main as manip_il
-from manip_il.rewards.methods import METHODS, learn
-from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 from manip_il.tasks.carry.grid import Grid
 from manip_il.tasks.carry.layout import TASTES
 from manip_il.tasks.carry.obstacles import layout_of
+from manip_il.tasks.carry.paths import PathProblem, cheapest_path, plan
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import env_of
 from manip_il.tasks.pick_place import OBJECT

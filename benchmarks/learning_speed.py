@@ -20,12 +20,12 @@ import mujoco
 import numpy as np
 from _machine import describe_machine
 
-from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.algorithms.run import Run
-from manip_il.algorithms.vector_env import RobotEpisode
+from manip_il.chapter.discriminators import Discriminator
+from manip_il.chapter.learning_config import LearningConfig
+from manip_il.chapter.vector_env import RobotEpisode
 from manip_il.cli.main import main as command
 from manip_il.collect.workers import Engine
-from manip_il.learn.discriminators import Discriminator
 from manip_il.sim.env import ManipEnv
 from manip_il.tasks.config import make_config
 

@@ -24,6 +24,10 @@ from pathlib import Path
 import numpy as np
 from _machine import describe_machine
 
+from manip_il.chapter.preferences.fitting import TIE, true_difference
+from manip_il.chapter.preferences.frames import find_datasets
+from manip_il.chapter.preferences.pairs import choose_pairs
+from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.main import main as manip_il
 from manip_il.data import schema
 from manip_il.data.build import merge_datasets, rewrite_columns
@@ -32,11 +36,7 @@ from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.side import Side
-from manip_il.learn.reward import LearnedReward
 from manip_il.learn.training_state import PRETRAINED_MODEL
-from manip_il.preferences.fitting import TIE, true_difference
-from manip_il.preferences.frames import find_datasets
-from manip_il.preferences.pairs import choose_pairs
 
 AGREEMENT, AREA, POINTS, P_VALUE = 0.90, 0.95, 0.15, 0.001
 _FRESH, _CLIP, _DRAWS = 2_000, 20, 5

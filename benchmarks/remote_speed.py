@@ -35,7 +35,7 @@ from huggingface_hub.utils import disable_progress_bars
 from s3fs import S3FileSystem
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from manip_il.store.transfer import open_remote, pull, push
+from manip_il.bridges.store.transfer import open_remote, pull, push
 from tests.store.servers import TOKEN, Hub, Sshd, hub_server, s3_server, sshd_server, talk_to
 
 BUCKET = "benchmark"

@@ -25,7 +25,8 @@ import numpy as np
 from _machine import describe_machine
 from scipy.stats import binomtest
 
-from manip_il.algorithms.inverse import CARRY, carried_stretch, read_carried
+from manip_il.chapter.inverse import CARRY, carried_stretch, read_carried
+from manip_il.chapter.rewards.methods import METHODS, learn
 from manip_il.cli.main import main as manip_il
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_spec
@@ -34,7 +35,6 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes, read_journal
 from manip_il.data.schema import ENVIRONMENT_STATE
 from manip_il.mdp import Episode
-from manip_il.rewards.methods import METHODS, learn
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 from manip_il.tasks.carry.layout import OBSTACLES, TASTES, Reward, path_features
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout

@@ -40,7 +40,7 @@ IMPORTED_ONCE = [
     "manip_il.evaluation.eval_report",
     "manip_il.learn.policy",
     "manip_il.learn.train",
-    "manip_il.store.transfer",
+    "manip_il.bridges.store.transfer",
     "lerobot.policies.act.modeling_act",
     "pyarrow.parquet",
 ]

@@ -18,7 +18,7 @@ EPISODES = layout.EPISODES_PATH.format(chunk_index=0, file_index=0)
 
 
 def lines(root: Path) -> list[str]:
-    from manip_il.doctor.examine import examine_folder
+    from manip_il.bridges.doctor.examine import examine_folder
 
     return [str(finding) for finding in examine_folder(root)]
 

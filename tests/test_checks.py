@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 from manip_il import checks
+from manip_il.bridges.mcap.read import read_messages, read_topics
+from manip_il.bridges.store.manifest import File
 from manip_il.data.camera import open_video
 from manip_il.data.journal import read_journal
 from manip_il.data.json_lines import read_lines
 from manip_il.data.parquet_files import count_rows, read_file
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.network import read_weights
-from manip_il.mcap.read import read_messages, read_topics
 from manip_il.robots.files import ModelFiles
-from manip_il.store.manifest import File
 
 
 @pytest.mark.parametrize("value", ["", ".", "..", ".hidden", "a..b", "../a", "a\\b", "a\n", "a\0", "~", "é", "a" * 101])

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from manip_il.bridges.doctor.examine import examine_folder
 from manip_il.collect.edits import render_states
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.expert import Expert
@@ -14,7 +15,6 @@ from manip_il.collect.job import RolloutJob
 from manip_il.data import schema
 from manip_il.data.build import build
 from manip_il.data.journal import Journal, read_journal
-from manip_il.doctor.examine import examine_folder
 from manip_il.evaluation.suites import varied
 from manip_il.mdp import Episode, State
 from manip_il.sim.conditions import Condition

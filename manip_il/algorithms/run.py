@@ -62,7 +62,7 @@ from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.events import standard_in
 
 if TYPE_CHECKING:  # rollouts alone do not need torch and stable-baselines3
-    from manip_il.algorithms.agent import Agent
+    from manip_il.chapter.agent import Agent
 
 BEST = "best"
 CHECKPOINTS = "checkpoints"
@@ -219,7 +219,7 @@ class Run:
 
     def agent(self) -> Agent:
         """Return a new agent for reinforcement learning."""
-        from manip_il.algorithms.agent import Agent
+        from manip_il.chapter.agent import Agent
 
         return Agent(self.config, self._clock)
 

@@ -161,7 +161,7 @@ def _is_reader_gone() -> bool:
 
 def _clean(text: str, words: list[str]) -> str:
     """Remove control characters, and tokens, keys and passwords from the command line or a library's errors."""
-    from manip_il.store.errors import redact
+    from manip_il.bridges.store.errors import redact
 
     return printable(redact(text, words))
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from manip_il.algorithms.learning_config import LearningConfig
-from manip_il.algorithms.ppo import ppo
 from manip_il.algorithms.results import Result, best_validation, validations
 from manip_il.algorithms.run import Run
+from manip_il.chapter.adversarial_config import DiscriminatorConfig, PPOConfig
+from manip_il.chapter.learning_config import LearningConfig
+from manip_il.chapter.ppo import ppo
 from manip_il.cli.main import main
 from manip_il.collect.workers import Engine
-from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.tasks.config import make_config
 

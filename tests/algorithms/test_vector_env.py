@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
+from manip_il.chapter.vector_env import ActionRange, Lockstep, RobotEpisode
 from manip_il.learn.action_spaces import Conversion
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import env_of

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from manip_il.chapter.reward import RewardNetwork, RewardShape, ways_of, write_reward
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_spec
-from manip_il.learn.reward import RewardNetwork, RewardShape, ways_of, write_reward
 from manip_il.tasks.config import EnvConfig, make_config
 
 from ..collect.clones import clone

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+from manip_il.bridges.store.errors import RemoteError
 from manip_il.cli.main import main
-from manip_il.store.errors import RemoteError
 
 LETTERS = "abcdefgijkmnqtuvwyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789@:/%#?[]!&=+.~-_\\'\"$ "
 SECRETS = st.text(LETTERS, min_size=8, max_size=20).filter(lambda text: text == text.strip())

@@ -12,13 +12,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from manip_il.bridges.store.transfer import open_remote, pull, push
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.gate import check_arrived
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
-from manip_il.store.transfer import open_remote, pull, push
 
 from ..damage import DATA, EPISODES, edit_json
 from ..pictures import encoded, store_pictures, write
@@ -60,7 +60,7 @@ def test_a_cell_without_its_picture_is_followed_by_no_reader(root: Path, cell: A
 def test_such_a_dataset_is_not_pulled(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     remote = open_remote(f"file://{tmp_path}/store", quiet=True)
     set_first(root, {"bytes": None, "path": "http://127.0.0.1:1/a.png"})
-    monkeypatch.setattr("manip_il.store.transfer.examine_folder", lambda root: [])  # another program pushed it
+    monkeypatch.setattr("manip_il.bridges.store.transfer.examine_folder", lambda root: [])  # another program pushed it
     push(root, remote)
     with pytest.raises(ManipError, match=rf"{DATA}: column '{KEY}' has no PNG or JPEG in row 0"):
         pull(remote, tmp_path / "here")

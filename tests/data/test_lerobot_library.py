@@ -13,11 +13,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from manip_il.bridges.doctor.examine import examine_folder, has_errors
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.video_config import VideoConfig
-from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.mdp import Episode
 
 from ..damage import DATA, EPISODES

@@ -17,11 +17,11 @@ import pytest
 import torch
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
+from manip_il.bridges.doctor.examine import examine_folder
 from manip_il.cli.main import main
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
-from manip_il.doctor.examine import examine_folder
 from manip_il.errors import MismatchError
 from manip_il.learn.policy import LearnedPolicy
 

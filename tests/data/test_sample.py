@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from manip_il.bridges.doctor.examine import examine_folder
 from manip_il.cli.main import main
 from manip_il.data.dataset import Dataset
-from manip_il.doctor.examine import examine_folder
 
 from ..damage import digests
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from manip_il.bridges.doctor.examine import examine_folder
 from manip_il.data import schema as s
 from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.doctor.examine import examine_folder
 from manip_il.mdp import Episode
 
 from ..pictures import episode_frames, read_episodes, write

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from manip_il.bridges.doctor.examine import examine_folder, has_errors
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
 from manip_il.data.video import try_encoder
 from manip_il.data.video_config import VideoConfig
-from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import UnknownName
 from manip_il.learn.checkpoint import Origin
 from manip_il.mdp import Episode

@@ -12,10 +12,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from manip_il.bridges.doctor.examine import examine_folder
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
-from manip_il.doctor.examine import examine_folder
 
 from ..damage import DATA, EPISODES, cut, edit_json, edit_table
 from ..pictures import encoded

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from lerobot.datasets.compute_stats import compute_episode_stats
 
+from manip_il.bridges.doctor.examine import examine_folder, repair
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes
-from manip_il.doctor.examine import examine_folder, repair
 from manip_il.errors import ManipError
 
 from ..damage import DATA, cut, digests, edit_json, edit_table, lines

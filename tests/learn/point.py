@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from manip_il.algorithms.vector_env import ActionRange, Lockstep
-from manip_il.learn.adversarial_config import PPOConfig
+from manip_il.chapter.actor_critic import Learner, seed_generators
+from manip_il.chapter.adversarial_config import PPOConfig
+from manip_il.chapter.vector_env import ActionRange, Lockstep
 from manip_il.learn.network import MLPNetwork, Shape
-from manip_il.learn.ppo import Learner, seed_generators
 
 STEPS, EPISODES = 10, 8
 ACTIONS = ActionRange(*(np.array(values, np.float32) for values in ([0, 0], [0.5, 0], [-1, 0], [1, 0])))

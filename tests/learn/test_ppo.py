@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from manip_il.learn.ppo import seed_generators
-from manip_il.learn.transitions import Transitions
+from manip_il.chapter.actor_critic import seed_generators
+from manip_il.chapter.transitions import Transitions
 
 from .point import EPISODES, STEPS, learner
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.learn import transitions
-from manip_il.learn.transitions import Demonstrations, read_demonstrations
+from manip_il.chapter import transitions
+from manip_il.chapter.transitions import Demonstrations, read_demonstrations
 from manip_il.mdp import Actor
 
 from .conftest import EPISODES, LENGTH, make_table

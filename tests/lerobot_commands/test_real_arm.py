@@ -16,10 +16,10 @@ from lerobot.rollout.inference.sync import SyncInferenceEngine
 from lerobot.utils.constants import OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
+from manip_il.bridges.doctor.examine import examine_folder, has_errors
 from manip_il.cli.main import main
 from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, STATE
-from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.robots.table import get_robot
 from manip_il.tasks.envs import scene_of

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from manip_il.bridges.mcap.export import MAPPING, export_dataset, left_out
+from manip_il.bridges.mcap.importing import import_files, list_files
+from manip_il.bridges.mcap.mapping import load_mapping
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.errors import NotFiniteError
-from manip_il.mcap.export import MAPPING, export_dataset, left_out
-from manip_il.mcap.importing import import_files, list_files
-from manip_il.mcap.mapping import load_mapping
 from manip_il.mdp import Episode
 
 from ..damage import DATA, edit_json, edit_table

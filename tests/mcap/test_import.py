@@ -12,9 +12,9 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from manip_il.bridges.mcap.importing import import_files, pick, read_frames
+from manip_il.bridges.mcap.mapping import TopicSource
 from manip_il.errors import ManipError
-from manip_il.mcap.importing import import_files, pick, read_frames
-from manip_il.mcap.mapping import TopicSource
 
 from ..pictures import encoded
 from .use import feature, load, ramp, write

@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import register_schema
 
-from manip_il.mcap.mapping import Mapping, load_mapping
+from manip_il.bridges.mcap.mapping import Mapping, load_mapping
 
 MS = 1_000_000
 Messages = Iterable[tuple[int, Any]]  # stamp [ms], content

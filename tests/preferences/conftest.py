@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from manip_il.chapter.preferences.pairs import Clips, choose_pairs
 from manip_il.data import schema as s
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.learn.network import threads
 from manip_il.mdp import Episode
-from manip_il.preferences.pairs import Clips, choose_pairs
 
 from ..synthetic import MakeEpisode, make_episode, offline, spec
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
+from manip_il.chapter.preferences.answers import Preferences
+from manip_il.chapter.preferences.asking import render_films, render_page
+from manip_il.chapter.preferences.pairs import Pairs
 from manip_il.evaluation.film import encode_mp4
-from manip_il.preferences.answers import Preferences
-from manip_il.preferences.asking import render_films, render_page
-from manip_il.preferences.pairs import Pairs
 
 from ..evaluation.browser import PATIENCE, Opened, chromium, opened
 from .conftest import clips_of

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.chapter.preferences.pairs import Pairs
 from manip_il.cli.main import main
-from manip_il.preferences.pairs import Pairs
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
 

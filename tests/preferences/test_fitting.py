@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from manip_il.data.dataset import Dataset
-from manip_il.errors import MismatchError
-from manip_il.learn.reward import (
+from manip_il.chapter.preferences.answers import Teacher, answer_pairs, join_answers
+from manip_il.chapter.preferences.fitting import fit_answers
+from manip_il.chapter.reward import (
     Compared,
     LearnedReward,
     RewardShape,
@@ -20,8 +20,8 @@ from manip_il.learn.reward import (
     ways_of,
     write_reward,
 )
-from manip_il.preferences.answers import Teacher, answer_pairs, join_answers
-from manip_il.preferences.fitting import fit_answers
+from manip_il.data.dataset import Dataset
+from manip_il.errors import MismatchError
 
 SHAPE = RewardShape(members=3, width=16)
 
@@ -68,7 +68,7 @@ def test_what_is_said_of_a_held_out_pair_does_not_depend_on_its_answer(clips, an
     said = []
     for better in (answers.better, turned):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("manip_il.learn.reward._EPOCHS", 1)
+            patch.setattr("manip_il.chapter.reward._EPOCHS", 1)
             said.append(
                 fit_reward(clips.inputs, Compared(rows[:, 0], rows[:, 1], better, answers.pair), SHAPE, 0).logits
             )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from manip_il.rewards.max_entropy import soft_plan
+from manip_il.chapter.rewards.max_entropy import soft_plan
 from tests.rewards.grids import acyclic, all_paths, draw, grid
 
 WEIGHTS = np.array([1.0, 0.3, 2.0])

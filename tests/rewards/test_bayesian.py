@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from manip_il.rewards.bayesian import Choices, Posterior, draw_posterior, fit, sample
-from manip_il.rewards.paths import Demonstration, PathProblem, open_features, rivals
+from manip_il.chapter.rewards.bayesian import Choices, Posterior, draw_posterior, fit, sample
+from manip_il.tasks.carry.paths import Demonstration, PathProblem, open_features, rivals
 from tests.rewards.grids import acyclic, all_paths, demonstrations, excess
 
 TRUTH = np.array([1.0, 4.0, 2.0])

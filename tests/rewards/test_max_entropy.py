@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from manip_il.rewards.max_entropy import fit, loss_of, soft_plan
-from manip_il.rewards.paths import Demonstration
+from manip_il.chapter.rewards.max_entropy import fit, loss_of, soft_plan
+from manip_il.tasks.carry.paths import Demonstration
 from tests.rewards.grids import draw, grid
 
 WEIGHTS = np.array([3.5, 2.0, 5.0])

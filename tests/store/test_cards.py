@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from huggingface_hub import DatasetCard, ModelCard
 
+from manip_il.bridges.store.cards import write_cards
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import OURS
 from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import Origin
-from manip_il.store.cards import write_cards
 
 from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint

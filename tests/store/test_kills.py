@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.store.transfer import open_remote, pull, push
+from manip_il.bridges.store.transfer import open_remote, pull, push
 
 from .conftest import content, make_run
 from .servers import talk_to

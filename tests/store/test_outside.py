@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from s3fs import S3FileSystem
 
+from manip_il.bridges.store.arrival import Arrival
+from manip_il.bridges.store.manifest import Manifest
+from manip_il.bridges.store.transfer import open_remote, pull, push
 from manip_il.cli.main import main
 from manip_il.errors import ManipError
-from manip_il.store.arrival import Arrival
-from manip_il.store.manifest import Manifest
-from manip_il.store.transfer import open_remote, pull, push
 
 from .conftest import DATASET, POLICY, SAMPLE, content, make_run
 from .servers import TOKEN, Hub, Sshd, hub_server

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.bridges.doctor.finding import NotWhole
+from manip_il.bridges.store.errors import RemoteError
+from manip_il.bridges.store.manifest import MANIFEST_FILE
+from manip_il.bridges.store.objects import Objects
+from manip_il.bridges.store.transfer import open_remote, pull, push
 from manip_il.data.dataset import Dataset
-from manip_il.doctor.finding import NotWhole
 from manip_il.errors import FolderExistsError, UsageError
-from manip_il.store.errors import RemoteError
-from manip_il.store.manifest import MANIFEST_FILE
-from manip_il.store.objects import Objects
-from manip_il.store.transfer import open_remote, pull, push
 
 from ..learn.tiny_policies import write_checkpoint
 from .conftest import DATASET, POLICY, SAMPLE, content, make_run

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from manip_il.theory.bounds import clone, curves, losses_of
-from manip_il.theory.processes import PROCESSES, RIGHT, WRONG, Process
+from manip_il.chapter.theory.bounds import clone, curves, losses_of
+from manip_il.chapter.theory.processes import PROCESSES, RIGHT, WRONG, Process
 
 FEW = (10, 40, 160)
 

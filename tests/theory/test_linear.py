@@ -1,6 +1,6 @@
 """An error that a clone does not correct goes the way of the open loop; noise on the demonstrations mends it."""
 
-from manip_il.theory.linear import GUST, drifts
+from manip_il.chapter.theory.linear import GUST, drifts
 
 
 def test_clones_drift_with_the_open_loop_and_noise_mends_it():

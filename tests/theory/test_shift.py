@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from manip_il.theory.shift import relative_distance
+from manip_il.chapter.theory.shift import relative_distance
 
 
 def visited(seed: int, off: float = 0.0) -> np.ndarray:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from manip_il.bridges.doctor.examine import examine_folder, repair
+from manip_il.bridges.doctor.finding import Finding, NotWhole, warning
 from manip_il.cli.data_check import CheckOptions, RepairOptions
 from manip_il.cli.progress import say
 from manip_il.cli.run.inputs import differences
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import OURS
-from manip_il.doctor.examine import examine_folder, repair
-from manip_il.doctor.finding import Finding, NotWhole, warning
 from manip_il.errors import ManipError
 
 

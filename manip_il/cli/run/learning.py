@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.algorithms.results import Watch, learning_report, validations
 from manip_il.algorithms.run import Run
+from manip_il.chapter.learning_config import LearningConfig
+from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.learning import GailOptions, Learning, PpoOptions
 from manip_il.cli.outputs import REPORT_FILE, write_page
 from manip_il.cli.progress import Stages, say
@@ -18,7 +19,6 @@ from manip_il.data.schema import RobotTaskSpec
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.rounds import METRICS_FILE
 from manip_il.learn.checkpoint import Origin
-from manip_il.learn.reward import LearnedReward
 from manip_il.tasks.config import stored_config
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from manip_il.bridges.mcap.export import MAPPING, export_dataset, left_out
+from manip_il.bridges.mcap.importing import import_files, list_files
+from manip_il.bridges.mcap.mapping import load_mapping
 from manip_il.cli.outputs import kind_of_output, prepare_output, save_options
 from manip_il.cli.progress import progress, say, say_next
 from manip_il.cli.transfer import McapExportOptions, McapImportOptions
 from manip_il.data.atomic import new_folder
 from manip_il.data.dataset import Dataset
-from manip_il.mcap.export import MAPPING, export_dataset, left_out
-from manip_il.mcap.importing import import_files, list_files
-from manip_il.mcap.mapping import load_mapping
 
 
 def run_mcap_export(options: McapExportOptions) -> None:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from manip_il.chapter.preferences.answers import Preferences, Teacher, answer_pairs, join_answers
+from manip_il.chapter.preferences.asking import render_films, render_page
+from manip_il.chapter.preferences.fitting import fit_answers, summary_lines
+from manip_il.chapter.preferences.frames import find_datasets
+from manip_il.chapter.preferences.pairs import Pairs, choose_pairs, join_pairs, read_clips
+from manip_il.chapter.reward import LearnedReward, shape_for, write_reward
 from manip_il.cli.progress import progress, say, say_next
 from manip_il.cli.reward import AnswerOptions, AskOptions, FitOptions, OfPairs, PairsOptions
 from manip_il.data.atomic import write_file, write_json
 from manip_il.data.dataset import Dataset
 from manip_il.evaluation.policy_folder import find_policy
-from manip_il.learn.reward import LearnedReward, shape_for, write_reward
 from manip_il.learn.training_state import PRETRAINED_MODEL
-from manip_il.preferences.answers import Preferences, Teacher, answer_pairs, join_answers
-from manip_il.preferences.asking import render_films, render_page
-from manip_il.preferences.fitting import fit_answers, summary_lines
-from manip_il.preferences.frames import find_datasets
-from manip_il.preferences.pairs import Pairs, choose_pairs, join_pairs, read_clips
 from manip_il.seeding import rng_for, stream_base
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from manip_il.chapter.preferences import scores as scoring
+from manip_il.chapter.preferences.frames import read_frames
+from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.data_check import ScoreOptions
 from manip_il.cli.outputs import publish
 from manip_il.errors import ManipError
 from manip_il.evaluation.policy_folder import find_policy
-from manip_il.learn.reward import LearnedReward
-from manip_il.preferences import scores as scoring
-from manip_il.preferences.frames import read_frames
 
 PROGRESS = "progress"  # value of --reward: score by true progress
 

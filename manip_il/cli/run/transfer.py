@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from rich import filesize
 
+from manip_il.bridges.store.transfer import open_remote, pull, push
 from manip_il.cli.progress import has_bars, say, say_next
 from manip_il.cli.transfer import (
     PullOptions,
     PushOptions,
 )
-from manip_il.store.transfer import open_remote, pull, push
 
 
 def run_push(options: PushOptions) -> None:

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.mdp import F64, I64
-from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.tasks.carry.layout import Layout, Reward
+from manip_il.tasks.carry.paths import PathProblem, cheapest_path, plan
 
 CELL = 0.02  # grid spacing, at full scale [m]
 BEYOND = 0.09  # how far the grid extends beyond the workspace's half width, at full scale [m]

@@ -1,0 +1,117 @@
+"""Export any LeRobot v3.0 dataset as MCAP: one file per episode, one topic per column, bit for bit.
+
+States and actions become `foxglove.JointStates`, other numbers LeRobot's scalars, decoded pictures `foxglove.RawImage`,
+text `foxglove.Log`. With `mapping.yaml`, next to the files, an import recreates the dataset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from mcap.writer import CompressionType, Writer
+
+from manip_il.bridges.mcap.mapping import TASK, TEXT
+from manip_il.data import foxglove
+from manip_il.data import lerobot_layout as layout
+from manip_il.data import schema as s
+from manip_il.data.camera import Camera
+from manip_il.data.dataset import Dataset
+from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature, Info
+from manip_il.mdp import require_finite
+
+MAPPING = "mapping.yaml"
+_TASK_TOPIC = "/task"
+_HEADER = """\
+# manip-il data from-mcap FOLDER NEW_DATASET --mapping=FOLDER/mapping.yaml recreates the dataset.
+# Pictures are kept as they are (video: false); with video: true they are re-encoded, with loss.
+"""
+_JOINTS = (s.STATE, s.ACTION, s.EXECUTED_ACTION)
+_TOLERANCE = 0.25  # [frames]; our own stamps are exact
+_BATCH = 64  # decoded pictures in memory at a time
+
+
+def left_out(info: Info) -> list[str]:
+    """Return the columns that are not exported: language, depth and other pictures that are not RGB."""
+    return [key for key in info.features if key not in INDEX_FEATURES and info.features[key] not in _columns(info)]
+
+
+def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
+    """Write every episode to `folder/episode_<index>.mcap`, yield its path, then write the mapping.
+
+    The same dataset gives the same bytes. Raises `NotFiniteError` for NaN and infinity, which JSON lacks, and what
+    `Dataset.columns` and `Dataset.camera` raise.
+    """
+    columns = _columns(dataset.info)
+    numbers = [one.key for one in columns if one.dtype not in PICTURES]
+    table = dataset.columns([*numbers, layout.TASK_INDEX])
+    for key in numbers:
+        require_finite(f"{dataset.root}, column {key!r}", table[key])
+    texts = dataset.texts(table[layout.TASK_INDEX])
+    cameras = {one.key: dataset.camera(one.key) for one in columns if one.dtype in PICTURES}
+    episodes, rate = dataset.episodes, s.exact_rate(dataset.fps)
+    for place, episode in enumerate(episodes.index.tolist()):
+        start, stop = int(episodes.start[place]), int(episodes.stop[place])
+        times = foxglove.frame_times(stop - start, rate)
+        channels = {_TASK_TOPIC: foxglove.texts(TASK, texts[start:stop], times)}
+        for one in columns:
+            values = _pictures(cameras[one.key], start, stop) if one.key in cameras else table[one.key][start:stop]
+            channels[_topic(one.key)] = _messages(one, values, times)
+        path = folder / f"episode_{episode:06d}.mcap"
+        with path.open("wb") as stream:
+            writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
+            writer.start(profile="", library="manip_il")
+            foxglove.add_channels(writer, channels, times)
+            writer.finish()
+        yield path
+    mapping = yaml.safe_dump(_mapping_of(dataset.info), sort_keys=False, allow_unicode=True, default_flow_style=None)
+    (folder / MAPPING).write_text(_HEADER + mapping, encoding="utf-8")
+
+
+def _mapping_of(info: Info) -> dict[str, Any]:
+    """Return the mapping with which an import recreates the dataset."""
+    near = {"resample": "nearest", "tolerance": round(_TOLERANCE / info.fps, 6)}
+    features: dict[str, Any] = {}
+    for one in _columns(info):
+        about: dict[str, Any] = {"video": False}
+        if one.dtype not in PICTURES:
+            path = "message" if one.dtype == TEXT else "joints[:].position" if _is_joints(one) else "scalars[:].value"
+            about = {"field": path, "dtype": one.dtype, "names": one.names, "shape": list(one.shape)}
+        features[one.key] = {"topic": _topic(one.key), **about, **near}
+    task = {"topic": _TASK_TOPIC, "field": "message", **near}
+    return {"fps": info.fps, "robot_type": info.robot or None, "task": task, "features": features}
+
+
+def _columns(info: Info) -> list[Feature]:
+    columns = [feature for key, feature in info.features.items() if key not in INDEX_FEATURES]
+    return [one for one in columns if one.dtype in (*NUMBERS, TEXT) or one.is_rgb]
+
+
+def _messages(column: Feature, values: Any, times: foxglove.Times) -> foxglove.Messages:
+    if column.dtype in PICTURES:
+        return foxglove.images(column.key, values, times)
+    if column.dtype == TEXT:
+        return foxglove.texts(column.key, values.reshape(-1).tolist(), times)
+    values = values.reshape(len(times), -1)
+    if _is_joints(column):
+        return foxglove.joint_states(column.labels, values, times)
+    unnamed = [column.key] if column.size == 1 else [f"{column.key}_{place}" for place in range(column.size)]
+    labels = column.labels if column.names else unnamed  # as in LeRobot
+    return foxglove.scalars(labels, (values.astype(np.int64) if values.dtype == bool else values).tolist())
+
+
+def _pictures(camera: Camera, start: int, stop: int) -> Iterator[foxglove.U8]:
+    for first in range(start, stop, _BATCH):
+        yield from camera.rows(np.arange(first, min(first + _BATCH, stop)))
+
+
+def _is_joints(column: Feature) -> bool:
+    return column.key in _JOINTS and column.dtype.startswith("float")
+
+
+def _topic(key: str) -> str:
+    """Return a column's topic, with slashes instead of dots, because Foxglove splits paths at dots."""
+    return "/" + key.replace(".", "/")

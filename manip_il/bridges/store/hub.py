@@ -1,0 +1,216 @@
+"""A repository on the Hugging Face Hub, or the server at HF_ENDPOINT, through huggingface_hub.
+
+Files keep their paths, so that LeRobot reads them. A push is one commit on top of the version that the folder was
+compared with; then the tag `v3.0`, by which LeRobot finds datasets, is moved to that commit. The Hub provides the size
+and hash of each file of a commit; a manifest lists those that a push wrote, since a repository may hold others.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Collection, Generator, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import httpx
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, RepoFile, constants, set_client_factory
+from huggingface_hub.errors import RemoteEntryNotFoundError, RepositoryNotFoundError, RevisionNotFoundError
+from huggingface_hub.utils import disable_progress_bars
+from huggingface_hub.utils._http import default_client_factory
+
+from manip_il import checks
+from manip_il.bridges.store.arrival import Arrival
+from manip_il.bridges.store.cards import write_cards
+from manip_il.bridges.store.errors import SENT, RemoteError, explained
+from manip_il.bridges.store.manifest import CARD, CONFIG, MANIFEST_FILE, File, Kind, Manifest, PushPlan, policy_folder
+from manip_il.data.lerobot_layout import VERSION
+from manip_il.errors import UsageError
+
+_ADDRESS = re.compile(r"(datasets/|models/)?((?!datasets/|models/)\w[\w.-]*/\w[\w.-]*)(?:@(\w[\w./-]*))?")
+_HIDDEN = re.compile(r"(.*/)?\.[^./]")  # such as the Hub's own .gitattributes
+_COMMIT = re.compile(r"[0-9a-f]{40}")
+_OF_A_DATASET = ("data/", "meta/", "videos/")  # the layout's folders, which are replaced as one
+_ANSWERS = ContextVar[Arrival | None]("_ANSWERS", default=None)  # of the action in progress
+
+
+def _guard_token(request: httpx.Request) -> None:
+    """Remember the token, and remove it if another server is asked, as a page of a listing may name one."""
+    SENT.add(request.headers.get("authorization", "").removeprefix("Bearer "))
+    if not str(request.url).startswith(f"{constants.ENDPOINT}/"):
+        request.headers.pop("authorization", None)
+
+
+def _count(response: httpx.Response) -> None:
+    """Count an answer's bytes, as decompressed, whoever reads it."""
+    arrival, chunks = _ANSWERS.get() or Arrival(checks.LARGEST_READ), response.iter_bytes
+
+    def counted(chunk_size: int | None = None) -> Iterator[bytes]:
+        for chunk in chunks(chunk_size):
+            arrival.update(len(chunk))
+            yield chunk
+
+    response.iter_bytes = counted
+
+
+@contextmanager
+def _bounded(size: int = 0) -> Generator[None]:
+    """Bound all answers in this block together. size: of the file that they bring."""
+    token = _ANSWERS.set(Arrival(checks.LARGEST_READ + size))
+    try:
+        yield
+    finally:
+        _ANSWERS.reset(token)
+
+
+@cache
+def _use_client() -> None:
+    """Have huggingface_hub guard the token and count what arrives from now on."""
+    set_client_factory(_client)
+
+
+def _client() -> httpx.Client:
+    client = default_client_factory()
+    client.event_hooks = {"request": [*client.event_hooks["request"], _guard_token], "response": [_count]}
+    return client
+
+
+class Hub:
+    """A repository at a branch, tag or commit. quiet: show no progress bars."""
+
+    at_once = 8  # concurrent files
+
+    def __init__(self, address: str, revision: str | None = None, *, private: bool = False, quiet: bool = False):
+        """address: the part after `hf://`. Raises `UsageError` if it is invalid."""
+        found = _ADDRESS.fullmatch(address)
+        if not found or ".." in address or (revision and found[3] not in (None, revision)):
+            text = "expected hf://datasets/USER/NAME[@REVISION] or hf://USER/NAME[@REVISION], and one revision"
+            raise UsageError(f"the hf:// address is invalid; {text}")
+        self.kind: Kind = "dataset" if found[1] == "datasets/" else "policy"
+        self._place = found[2]
+        self._revision = revision or found[3]
+        self._private = private
+        self._repo: Any = {"repo_id": self._place, "repo_type": "dataset" if self.kind == "dataset" else "model"}
+        self.name = f"hf://{found[1] or ''}{self._place}{f'@{self._revision}' if self._revision else ''}"
+        _use_client()
+        self._api, self.quiet = HfApi(library_name="manip_il"), quiet
+        if quiet:
+            disable_progress_bars()
+
+    def read(self) -> Manifest | None:
+        """Return the current version; None if the repository or the revision does not exist."""
+        with explained(f"read {self.name}"), _bounded():
+            try:
+                about: Any = self._api.repo_info(**self._repo, revision=self._revision)
+            except (RepositoryNotFoundError, RevisionNotFoundError):
+                return None
+            head = about.sha or ""
+            if not _COMMIT.fullmatch(head):  # becomes part of paths
+                found = f"the commit {checks.shorten(head)}, not 40 hexadecimal digits"
+                raise RemoteError(f"{self.name} has {found}; is HF_ENDPOINT a Hub?")
+            tree = self._api.list_repo_tree(**self._repo, revision=head, recursive=True)
+            listed = {one.path: one for one in tree if isinstance(one, RepoFile)}
+            missing = sorted({one.rfilename for one in getattr(about, "siblings", None) or ()} - listed.keys())
+            if missing:
+                text = f"its list of files lacks {checks.shorten(missing[0])}, which the commit has; try again"
+                raise RemoteError(f"{self.name}: {text}")
+            files = {
+                path: File(one.lfs.size, one.lfs.sha256) if one.lfs else File(one.size, git_sha1=one.blob_id)
+                for path, one in listed.items()
+                if not _HIDDEN.match(path) and path != MANIFEST_FILE
+            }
+            copies = root_copies(files) if self.kind == "policy" else {}
+            are_equal = all(files.get(name) == files[path] for name, path in copies.items())
+            return Manifest(self.kind, files, head, copies=frozenset(copies if are_equal else ()))
+
+    def pushed(self, before: Manifest) -> dict[str, File]:
+        """Return the files of a version that a push wrote, by its manifest in the repository, without an edited card.
+
+        Without a manifest these are the folders of a dataset.
+        """
+        with tempfile.TemporaryDirectory(prefix="manip_il_manifest_") as folder, explained(f"read {self.name}"):
+            try:
+                self.download(before, Path(folder), MANIFEST_FILE)
+            except RemoteEntryNotFoundError:
+                named = _OF_A_DATASET if self.kind == "dataset" else ()
+                return {path: file for path, file in before.files.items() if path.startswith(named)}
+            content = checks.read_bytes(Path(folder, MANIFEST_FILE), "a manifest")
+            pushed = dict(Manifest.from_json(content, before.version).files)
+            if CARD in pushed.keys() & before.files.keys():
+                self.download(before, Path(folder), CARD)
+                if not pushed[CARD].fits(Path(folder, CARD)):
+                    del pushed[CARD]
+            return pushed
+
+    def with_card(self, source: Path, local: Mapping[str, Path], folder: Path, keeps: bool) -> dict[str, Path]:
+        """Return the files to push: `local`, a card, and a run's policy at the root.
+
+        Args:
+            source: The dataset, run or policy.
+            local: Its files by their paths in the repository.
+            folder: Where the card is written.
+            keeps: Whether the repository keeps its own card.
+        """
+        added = write_cards(source, self.kind, self._place, folder)
+        if keeps and added.pop(CARD, None):
+            local = {path: file for path, file in local.items() if path != CARD}
+        copies = root_copies(local) if self.kind == "policy" else {}
+        if not copies.keys() & local.keys():
+            added |= {name: local[path] for name, path in copies.items()}
+        return {**local, **added}
+
+    def write(self, plan: PushPlan) -> None:
+        """Commit on top of `plan.before` (the Hub refuses if it is outdated), then move a dataset's tag."""
+        with explained(f"push to {self.name}"), _bounded():
+            before, gone = plan.before or self._create(), plan.remove
+            if plan.before is None:  # a new branch begins with the files of the main branch
+                gone = sorted(before.files.keys() & self.pushed(before).keys() - plan.manifest.files.keys())
+            operations = [
+                *(CommitOperationAdd(path, str(plan.local[path])) for path in plan.upload),
+                *(CommitOperationDelete(path, is_folder=False) for path in gone),
+            ]
+            on: Any = {"revision": self._revision, "parent_commit": before.version}
+            if operations:
+                operations.append(CommitOperationAdd(MANIFEST_FILE, plan.manifest.to_json()))
+                self._api.create_commit(**self._repo, operations=operations, commit_message="manip-il push", **on)
+            if self.kind == "dataset" and self._revision in (None, "main"):
+                self._move_tag()
+
+    def download(self, manifest: Manifest, folder: Path, path: str) -> None:
+        """Download a file of a version to the same path in a folder, without checking its hash."""
+        where: Any = {**self._repo, "revision": manifest.version, "local_dir": folder}
+        file = manifest.files.get(path)
+        most = file.size if file else checks.LARGEST_READ
+        bounded: Any = Arrival(most)  # some servers send a file by other means than answers
+        with _bounded(most):
+            self._api.hf_hub_download(filename=path, force_download=True, tqdm_class=bounded, **where)
+
+    def _create(self) -> Manifest:
+        """Create the repository and the branch; return the branch's content: empty, or as on the main branch."""
+        self._api.create_repo(**self._repo, private=self._private, exist_ok=True)
+        if self._revision:
+            self._api.create_branch(**self._repo, branch=self._revision, exist_ok=True)
+        made = self.read()
+        if made is None or (made.files and not self._revision):
+            raise RemoteError(f"{self.name} was created by another push in the meantime; push again")
+        return made
+
+    def _move_tag(self) -> None:
+        """Delete LeRobot's tag and create it again on the main branch, because the Hub cannot move tags."""
+        refs = self._api.list_repo_refs(**self._repo)
+        head = next(one.target_commit for one in refs.branches if one.name == "main")
+        tag = next((one.target_commit for one in refs.tags if one.name == VERSION), None)
+        if tag not in (None, head):
+            self._api.delete_tag(**self._repo, tag=VERSION)
+        if tag != head:
+            self._api.create_tag(**self._repo, tag=VERSION, revision=head, exist_ok=True)
+
+
+def root_copies(paths: Collection[str]) -> dict[str, str]:
+    """Return which files of a run's policy are copied to the root, name -> path; {} for a policy without a run."""
+    folder = policy_folder(path for path in paths if path != CONFIG)
+    inside = {path.removeprefix(f"{folder}/"): path for path in paths if folder and path.startswith(f"{folder}/")}
+    return {name: path for name, path in inside.items() if "/" not in name and name != CARD}

@@ -1,0 +1,166 @@
+"""The files of one version of a dataset or run, with sizes and hashes, and their JSON form."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from manip_il import checks
+from manip_il.bridges.doctor.finding import journals_of
+from manip_il.bridges.store.errors import RemoteError
+from manip_il.data.lerobot_layout import INFO
+
+MANIFEST_FILE = "manip_il_manifest.json"
+JOURNALS = "journals"  # name of a folder of journals, in a pushed dataset or anywhere in a run
+CHECKPOINTS, LAST = "checkpoints", "last"  # the link `last` to the newest checkpoint is not pushed; a pull creates it
+CARD, CONFIG = "README.md", "config.json"  # the first once per repository, the second once per policy
+_CHECKPOINT = re.compile(rf"{CHECKPOINTS}/(\d+)/pretrained_model")
+_LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
+_DATA = re.compile(  # names of files that hold data; all others could be code, or pickles, which can run code
+    r".*\.(json|jsonl|ya?ml|toml|txt|md|csv|tsv|log|html|pdf|png|jpe?g|gif|webp|svg|mp4|parquet|arrow|mcap|safetensors|"
+    r"npz|npy|onnx|wandb|xml|urdf|stl|obj|mtl|bib)|LICENSE|NOTICE|events\.out\.tfevents\.[\w.-]+\.\d+",
+    re.I,
+)
+
+Kind = Literal["dataset", "policy"]
+
+
+@dataclass(frozen=True)
+class File:
+    """Size [bytes] and hash of a file: its sha256, or its git id if the Hub provides no sha256."""
+
+    size: int
+    sha256: str = ""
+    git_sha1: str = ""
+
+    def __post_init__(self) -> None:
+        """Raise `ManipError` for an invalid size or hash."""
+        checks.whole("the size of a remote file", self.size, 0, 2**63)
+        if not re.fullmatch("[0-9a-f]{64}|git:[0-9a-f]{40}", self.sha256 or f"git:{self.git_sha1}"):
+            raise RemoteError(f"a remote file has the hash {checks.shorten(self.sha256)}; expected hexadecimal digits")
+
+    @classmethod
+    def of(cls, path: Path) -> File:
+        """Return a file's size and sha256."""
+        with checks.open_outside(path, "a file") as file:
+            return cls(os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest())
+
+    def fits(self, path: Path) -> bool:
+        """Return whether a regular file has this size and hash."""
+        if path.is_symlink() or not path.is_file() or path.stat().st_size != self.size:
+            return False
+        digest = hashlib.sha256() if self.sha256 else hashlib.sha1(b"blob %d\0" % self.size, usedforsecurity=False)
+        with checks.open_outside(path, "a file") as file:
+            hashlib.file_digest(file, lambda: digest)
+        return digest.hexdigest() == (self.sha256 or self.git_sha1)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Files by path. version: the version's id on the remote.
+
+    copies: paths at the root that repeat the files of a run's policy; they are not pulled. replaced: hashes of objects
+    that only the version before names.
+    """
+
+    kind: Kind
+    files: Mapping[str, File]
+    version: str = ""
+    copies: frozenset[str] = frozenset()
+    replaced: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        """Raise `RemoteError` as `check_path` does."""
+        for path in self.files:
+            check_path(path)
+
+    def to_json(self) -> bytes:
+        """Return the content of the manifest file."""
+        files = [{"path": path, "size": one.size, "sha256": one.sha256} for path, one in sorted(self.files.items())]
+        table = {"version": 1, "kind": self.kind, "files": files, "replaced": sorted(self.replaced)}
+        return json.dumps(table, indent=1).encode()
+
+    @classmethod
+    def from_json(cls, data: bytes, version: str) -> Manifest:
+        """Read a manifest that `to_json` wrote. Raises `ManipError` for anything else."""
+        table = checks.parse_json("the manifest", data)
+        try:
+            if table["version"] != 1 or table["kind"] not in ("dataset", "policy"):
+                raise RemoteError("the manifest was written by another version of manip-il; use a newer one")
+            files = {one["path"]: File(one["size"], one["sha256"]) for one in table["files"]}
+            replaced = frozenset(File(0, sha256).sha256 for sha256 in table.get("replaced", ()))
+            return cls(table["kind"], files, version, replaced=replaced)
+        except (LookupError, TypeError, AttributeError) as error:
+            raise RemoteError("the manifest is invalid; push again, to an empty folder") from error
+
+
+@dataclass(frozen=True)
+class PushPlan:
+    """Difference between a folder and the remote's version (`before`). local: path -> file. upload, remove: paths."""
+
+    manifest: Manifest
+    before: Manifest | None
+    local: Mapping[str, Path]
+    upload: list[str]
+    remove: list[str]
+
+
+def check_path(path: object) -> None:
+    """Raise `RemoteError` for a path that leads outside its folder, is hidden, or is not of a known kind of data."""
+    parts = path.split("/") if isinstance(path, str) and path.isprintable() and "\\" not in path else [""]
+    text = "only files of data are pushed and pulled (such as .json, .parquet, .safetensors), no pickles and no code"
+    if not all(part and not part.startswith(".") for part in parts):
+        text = "expected a relative path inside the folder, without hidden files"
+    elif _DATA.fullmatch(parts[-1]):
+        return
+    raise RemoteError(f"the file {checks.shorten(path)} is refused; {text}")
+
+
+def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, Path]:
+    """Return the files of a dataset or run by their paths in the manifest, except hidden and unfinished ones.
+
+    journals: include a dataset's `<root>.journals`, as `journals/`, and the journals in a run. Raises `RemoteError` for
+    links.
+    """
+    local: dict[str, Path] = {}
+    for path in sorted(root.rglob("*")):
+        parts = path.relative_to(root).parts
+        if any(map(_LEFT_OUT.fullmatch, parts)) or (JOURNALS in parts[:-1] and not journals):
+            continue
+        if path.is_symlink():
+            if path.name != LAST or os.readlink(path) != newest(path.parent):
+                raise RemoteError(f"{path} is a link; links are not pushed: replace it with the file itself")
+        elif path.is_file():
+            local["/".join(parts)] = path
+    if journals and kind == "dataset" and (beside := journals_of(root)).is_dir():
+        local |= {f"{JOURNALS}/{name}": path for name, path in list_files(beside, kind).items()}
+    return local
+
+
+def datasets_in(folder: Path) -> list[Path]:
+    """Return the datasets in a folder: the folder itself, or those of a run's rounds."""
+    found = [path.parents[1] for path in folder.rglob(INFO)]
+    return sorted(root for root in found if not any(map(_LEFT_OUT.fullmatch, root.relative_to(folder).parts)))
+
+
+def newest(checkpoints: Path) -> str | None:
+    """Return the name of the newest checkpoint in a run's `checkpoints`; None for other or empty folders."""
+    steps = [path.name for path in checkpoints.iterdir() if path.name.isdecimal() and path.is_dir()]
+    return max(steps, key=int, default=None) if checkpoints.name == CHECKPOINTS else None
+
+
+def policy_folder(paths: Iterable[str]) -> str | None:
+    """Return the folder of a run's policy, given the paths of the run's files: "" for the root, None if there is none.
+
+    The policy is the best one, if the run has chosen one, else that of the newest checkpoint.
+    """
+    folders = {path.rpartition("/")[0] for path in paths if path.rpartition("/")[2] == CONFIG}
+    steps = sorted((int(found[1]), folder) for folder in folders if (found := _CHECKPOINT.fullmatch(folder)))
+    order = ("", "pretrained_model", "best/pretrained_model", *(folder for _, folder in reversed(steps)))
+    return next((folder for folder in order if folder in folders), None)

@@ -1,0 +1,205 @@
+"""Remotes other than the Hub, through fsspec: objects named by the sha256 of their bytes, and one manifest.
+
+    PLACE/manip_il_manifest.json       replaced last, atomically: readers see the old version or the new one
+         /objects/3f/3f9a...           each file's bytes, never changed
+
+Objects of the previous version stay until the next push, so that its readers can finish: the manifest lists them, and
+nothing else is ever removed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+import secrets
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, override
+from urllib.parse import unquote
+
+import fsspec
+import paramiko
+from fsspec.callbacks import TqdmCallback
+from fsspec.implementations.local import LocalFileSystem
+from fsspec.implementations.sftp import SFTPFileSystem
+
+from manip_il import checks
+from manip_il.bridges.store.arrival import Arrival
+from manip_il.bridges.store.errors import RemoteError, explained
+from manip_il.bridges.store.manifest import MANIFEST_FILE, File, Kind, Manifest, PushPlan
+from manip_il.errors import UnknownName, UsageError
+
+TIMEOUT = 30.0  # for connecting to an ssh server, and for each response [s]
+_FRESH = {"skip_instance_cache": True, "use_listings_cache": False}  # for object stores: no stale listings
+_S3 = {"max_concurrency": 4, "config_kwargs": {"read_timeout": 120}, **_FRESH}
+_OPTIONS: dict[str, dict[str, Any]] = {"file": {"auto_mkdir": True}, "s3": _S3, "sftp": {}}
+_SFTP = re.compile(
+    r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)(:[1-5]?\d{1,4}|:6[0-4]\d{3}|:65[0-4]\d{2}|:655[0-2]\d|:6553[0-5])?/[^@]+"
+)
+_AT_ONCE, _LARGE_AT_ONCE = 10, 4  # concurrent files; s3fs has ten connections, and keeps parts of large ones in memory
+_LARGE = 10_000_000  # [bytes]
+_CHUNK = 2**20  # [bytes]
+
+
+class Local(LocalFileSystem):
+    """This machine's files, of which a pull reads only regular ones."""
+
+    @override
+    def get_file(self, path1: Any, path2: Any, callback: Any = None, **kwargs: Any) -> None:
+        """Copy a file and count its bytes."""
+        with checks.open_outside(Path(path1), "a file of a push", RemoteError) as source:
+            _copy(source, path2, callback)
+
+
+class Sftp(SFTPFileSystem):
+    """SFTP with the user's ~/.ssh/config, to hosts in ~/.ssh/known_hosts only; fsspec's class accepts any host key."""
+
+    cachable = False
+    put: Any = fsspec.AbstractFileSystem.put  # fsspec's SFTP class can put only a single file
+
+    def _connect(self) -> None:
+        logging.getLogger("paramiko").setLevel(logging.CRITICAL)  # paramiko also raises the errors that it logs
+        config, login = Path.home() / ".ssh" / "config", self.ssh_kwargs
+        known = dict(paramiko.SSHConfig.from_path(str(config)).lookup(self.host)) if config.is_file() else {}
+        self.client = paramiko.SSHClient()
+        self.client.load_system_host_keys()
+        self.client.set_missing_host_key_policy(paramiko.RejectPolicy())
+        self.client.connect(
+            str(known.get("hostname", self.host.strip("[]"))),
+            login.get("port") or int(known.get("port", 22)),
+            login.get("username") or known.get("user"),
+            unquote(login.get("password") or "") or None,
+            key_filename=known.get("identityfile"),
+            timeout=TIMEOUT,
+            banner_timeout=TIMEOUT,
+            auth_timeout=TIMEOUT,
+        )
+        self.ftp = self.client.open_sftp()
+        self.ftp.get_channel().settimeout(TIMEOUT)  # pyright: ignore[reportOptionalMemberAccess]
+
+    @override
+    def put_file(self, lpath: Any, rpath: Any, callback: Any = None, mode: str = "", **kwargs: Any) -> None:
+        """Upload a file and make its folder."""
+        self.makedirs(self._parent(rpath), exist_ok=True)
+        self.ftp.put(str(lpath), str(rpath))
+
+    @override
+    def get_file(self, rpath: Any, lpath: Any, callback: Any = None, **kwargs: Any) -> None:
+        """Download a file and count its bytes."""
+        with self.ftp.open(str(rpath)) as source:
+            source.prefetch(min(source.stat().st_size or 0, callback.most))
+            _copy(source, lpath, callback)
+
+
+def _copy(source: Any, target: str, arrival: Arrival) -> None:
+    with open(target, "wb") as file:
+        for chunk in iter(partial(source.read, _CHUNK), b""):
+            arrival.update(len(chunk))
+            file.write(chunk)
+
+
+class Objects:
+    """A folder in any file system that fsspec supports. quiet: show no progress bars."""
+
+    kind: Kind | None = None  # the address does not say which
+
+    def __init__(self, scheme: str, url: str, *, quiet: bool = False):
+        """Raises `UsageError` for an unknown scheme, one whose package is not installed, or an invalid address."""
+        self._scheme, self.quiet = scheme, quiet
+        self.name = re.sub(r"(?<=://)([^/@:]*):.*@", r"\1@", url)
+        try:
+            own = {"file": Local, "sftp": Sftp}
+            self._class: Any = own.get(scheme) or fsspec.get_filesystem_class(scheme)
+        except ImportError as error:
+            raise UsageError(f"{scheme}:// needs another package: {error}") from None
+        except ValueError:
+            known = ("hf://", "s3://", "sftp://", "file://", "gs://", "az://")
+            raise UnknownName("scheme", f"{scheme}://", known) from None
+        if scheme == "sftp" and not _SFTP.fullmatch(url):
+            text = "expected sftp://[USER@]HOST[:PORT]/FOLDER; in a password write / as %2F, @ as %40, : as %3A"
+            raise UsageError(f"the sftp:// address is invalid; {text}")
+        self.at_once = _AT_ONCE if self._class.async_impl else 1
+        self._login, place = self._class._get_kwargs_from_urls(url), self._class._strip_protocol(url)
+        self._root = place.removeprefix("/~/").rstrip("/")  # relative to the user's home
+        self._manifest = f"{self._root}/{MANIFEST_FILE}"
+
+    @cached_property
+    def _fs(self) -> Any:
+        return self._class(**self._login, **_OPTIONS.get(self._scheme, _FRESH))
+
+    def read(self) -> Manifest | None:
+        """Return the current version; None if there is none."""
+        with explained(f"read {self.name}"):
+            try:
+                info = self._fs.info(self._manifest)
+            except (FileNotFoundError, NotADirectoryError):
+                return None
+            with tempfile.NamedTemporaryFile() as arrived:
+                self._fs.get_file(self._manifest, arrived.name, callback=Arrival(checks.LARGEST_READ))
+                data = arrived.read()
+            return Manifest.from_json(data, info.get("ETag") or hashlib.sha256(data).hexdigest())
+
+    def pushed(self, before: Manifest) -> Mapping[str, File]:
+        """Return the files of a version that a push wrote: all of them."""
+        return before.files
+
+    def write(self, plan: PushPlan) -> None:
+        """Upload missing objects, then replace the manifest and remove unused objects."""
+        with explained(f"push to {self.name}"):
+            found = self._fs.find(f"{self._root}/objects", detail=True)
+            if links := [name for name, info in found.items() if info.get("islink") or info["type"] == "link"]:
+                raise RemoteError(f"{links[0]} is a link, and nothing is written through links; remove it there")
+            there = {name.rpartition("/")[2]: info["size"] for name, info in found.items()}
+            files, before = plan.manifest.files, plan.before.files if plan.before else {}
+            missing = {one.sha256: path for path, one in files.items() if there.get(one.sha256) != one.size}
+            sources = [str(plan.local[path]) for path in missing.values()]
+            bar = TqdmCallback({"desc": "push", "unit": " files", "disable": True if self.quiet else None})
+            is_large = max([files[path].size for path in missing.values()], default=0) > _LARGE
+            at_once = {"batch_size": _LARGE_AT_ONCE if is_large else self.at_once} if self._fs.async_impl else {}
+            self._fs.put(sources, [self._object(key) for key in missing], callback=bar, **at_once)
+            for path in missing.values():
+                if plan.local[path].stat().st_size != files[path].size:
+                    raise RemoteError(f"{plan.local[path]} was modified during the push; push again")
+            if files != before:
+                old, new = ({one.sha256 for one in some.values()} for some in (before, files))
+                listed = plan.before.replaced if plan.before else set[str]()
+                unused = (listed & there.keys()) - old - new
+                self._switch(replace(plan.manifest, replaced=frozenset(old - new | unused)), plan.before)
+                with suppress(FileNotFoundError):  # another push removes them, too
+                    if unused:
+                        self._fs.rm([self._object(key) for key in unused])
+
+    def download(self, manifest: Manifest, folder: Path, path: str) -> None:
+        """Download the object of a file to the file's path in a folder, without checking its hash."""
+        file = manifest.files[path]
+        self._fs.get_file(self._object(file.sha256), str(folder / path), callback=Arrival(file.size))
+
+    def _switch(self, new: Manifest, before: Manifest | None) -> None:
+        """Replace the manifest if it still equals `before`: on S3 atomically, elsewhere after reading it once more."""
+        found, version = self.read(), before.version if before else None
+        try:
+            if (found.version if found else None) != version:
+                raise FileExistsError
+            if self._scheme in ("file", "sftp"):  # others replace a file atomically
+                partial = f"{self._root}/.{MANIFEST_FILE}.{secrets.token_hex(8)}.partial"
+                self._fs.pipe_file(partial, new.to_json())
+                self._fs.mv(partial, self._manifest)
+            else:
+                condition = {"IfMatch": version} if version else {"IfNoneMatch": "*"}
+                self._fs.pipe_file(self._manifest, new.to_json(), **(condition if self._scheme == "s3" else {}))
+        except OSError as error:
+            found = self.read()
+            if found and found.files == new.files:
+                return  # it succeeded, and only the response was lost
+            if (found.version if found else None) != version:
+                text = "was changed by another push in the meantime; nothing of this push is visible there; push again"
+                raise RemoteError(f"{self.name} {text}") from error
+            raise
+
+    def _object(self, key: str) -> str:
+        return f"{self._root}/objects/{key[:2]}/{key}"

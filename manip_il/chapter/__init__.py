@@ -1,0 +1,1 @@
+"""Methods of the chapter beyond cloning and DAgger: theory, inverse RL, preferences, GAIL, AIRL, PPO."""

@@ -1,0 +1,43 @@
+"""The chapter's other methods in Python, as the course uses them: theory, inverse RL, GAIL, preferences."""
+
+from __future__ import annotations
+
+from manip_il.algorithms.run import Run
+from manip_il.chapter.inverse import Inverse, read_carried
+from manip_il.chapter.learning_config import LearningConfig
+from manip_il.chapter.preferences.answers import Teacher, answer_pairs, join_answers
+from manip_il.chapter.preferences.fitting import fit_answers
+from manip_il.chapter.preferences.frames import read_frames
+from manip_il.chapter.preferences.pairs import choose_pairs
+from manip_il.chapter.reward import LearnedReward, shape_for
+from manip_il.chapter.rewards.methods import Learnt, learn
+from manip_il.chapter.theory.bounds import curves
+from manip_il.chapter.theory.processes import PROCESSES
+from manip_il.chapter.theory.shift import measure_shift
+from manip_il.collect.workers import Engine
+from manip_il.learn.checkpoint import Origin
+from manip_il.tasks.carry.layout import FEATURES, TASTES
+
+__all__ = [
+    "FEATURES",
+    "PROCESSES",
+    "TASTES",
+    "Engine",
+    "Inverse",
+    "LearnedReward",
+    "LearningConfig",
+    "Learnt",
+    "Origin",
+    "Run",
+    "Teacher",
+    "answer_pairs",
+    "choose_pairs",
+    "curves",
+    "fit_answers",
+    "join_answers",
+    "learn",
+    "measure_shift",
+    "read_carried",
+    "read_frames",
+    "shape_for",
+]

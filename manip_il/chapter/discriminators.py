@@ -1,0 +1,128 @@
+"""Discriminators of adversarial imitation, which tell expert from learner; their output is the reward.
+
+Both learn D = P(expert | transition) by logistic loss. GAIL's is any function of state and action (Ho & Ermon,
+Generative adversarial imitation learning, NeurIPS 2016). AIRL's has the form
+
+    D = exp f / (exp f + pi(a | s)),    f(s, a, s') = g(s, a) + gamma h(s') - h(s)
+
+so that at the optimum g is a reward up to shaping (Fu, Luo & Levine, Learning robust rewards with adversarial inverse
+reinforcement learning, ICLR 2018, equations 4 and 7). The reward of both is log D - log(1 - D); AIRL's is f - log pi.
+
+Here, AIRL's pi is divided by exp(-H), where H is its entropy. Otherwise -log pi, whose mean is H, would reward every
+step before the absorbing state but none in it, as no action is sampled there, and f would have to follow every change
+of H.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from manip_il.chapter.adversarial_config import DiscriminatorConfig
+from manip_il.chapter.transitions import F32, Transitions
+from manip_il.learn.network import MLPNetwork, perceptron
+from manip_il.mdp import I64
+
+LARGEST_REWARD = 10.0
+Batch = tuple[Tensor, Tensor, Tensor, Tensor]  # states (B, e), actions (B, n), next states (B, e), log pi (B,)
+
+
+class Discriminator(nn.Module):
+    """A discriminator, its optimiser and its input scales.
+
+    network: the actor, whose statistics scale the inputs. gamma: discount in AIRL's f; None for GAIL's form.
+    asks_density: whether the logit depends on the learner's log-density of the action, as in AIRL.
+    """
+
+    mean: Tensor
+    scale: Tensor
+    clamp: Tensor
+    free: Tensor
+
+    def __init__(self, config: DiscriminatorConfig, network: MLPNetwork, gamma: float | None = None) -> None:
+        super().__init__()
+        self.config, self.asks_density = config, gamma is not None
+        for name, value in (("mean", network.input_mean), ("scale", network.input_scale)):
+            self.register_buffer(name, value[: network.inputs].clone())
+        self.register_buffer("clamp", torch.tensor(network.clamp))
+        self.register_buffer("free", (network.target_scale > 0).float())
+        encoded = len(self.mean) + 1
+        self.g = perceptron(encoded + len(self.free), config.width, 2, 1, nn.ReLU)
+        self.h = None if gamma is None else perceptron(encoded, config.width, 2, 1, nn.ReLU)
+        self._gamma = gamma or 0.0
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=config.lr, fused=True)
+
+    def logits(self, batch: Batch) -> Tensor:
+        """Return log D - log(1 - D), (B,)."""
+        states, actions, next_states, log_prob = batch
+        g = self.g(torch.cat([states, actions], dim=1))
+        if self.h is None:
+            return g.squeeze(1)
+        return (g + self._gamma * self.h(next_states) - self.h(states)).squeeze(1) - log_prob
+
+    def reward(self, learner: Transitions, log_probs: F32 | None = None) -> F32:
+        """Return the reward of every transition, (N,), clipped to +-10.
+
+        log_probs: the learner's log-density of each action, (N,), if the discriminator `asks_density`.
+        """
+        with torch.no_grad():
+            rewards = self.logits(self._encode(learner, log_probs))
+        return rewards.clamp(-LARGEST_REWARD, LARGEST_REWARD).numpy().astype(np.float32)
+
+    def fit(
+        self, expert: Transitions, learner: Transitions, log_probs: tuple[F32, F32] | None, rng: np.random.Generator
+    ) -> dict[str, float]:
+        """Take an iteration's gradient steps; return the mean loss, and the initial accuracies on expert and learner.
+
+        log_probs: the log-densities, under the learner's policy, of the expert's and of the learner's actions, (N,)
+        each, if the discriminator `asks_density`.
+        """
+        data = [self._encode(one, log) for one, log in zip((expert, learner), log_probs or (None, None), strict=True)]
+        with torch.no_grad():
+            right = [(self.logits(data[0]) > 0).float().mean().item(), (self.logits(data[1]) < 0).float().mean().item()]
+        losses = [self._step(data, rng) for _ in range(self.config.steps)]
+        return {"loss": float(np.mean(losses)), "accuracy_expert": right[0], "accuracy_learner": right[1]}
+
+    def _step(self, data: Sequence[Batch], rng: np.random.Generator) -> float:
+        expert, learner = (_drawn(one, self.config.batch_size, rng) for one in data)
+        logits = torch.cat([self.logits(expert), self.logits(learner)])
+        labels = torch.cat([torch.ones(len(expert[0])), torch.zeros(len(learner[0]))])
+        loss = binary_cross_entropy_with_logits(logits, labels)
+        total = loss
+        if self.config.penalty:
+            total = loss + self.config.penalty * self._gradient_penalty(expert, learner, rng)
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        self.optimizer.step()
+        return loss.item()
+
+    def _gradient_penalty(self, expert: Batch, learner: Batch, rng: np.random.Generator) -> Tensor:
+        """Return the mean (|gradient of logit| - 1)^2 at random points between the batches (Gulrajani et al. 2017)."""
+        share = torch.from_numpy(rng.random((len(expert[0]), 1), dtype=np.float32))
+        mixed = [a * share + b * (1 - share) for a, b in zip(expert[:3], learner[:3], strict=True)]
+        inputs = [one.requires_grad_() for one in mixed]
+        log_prob = expert[3] * share[:, 0] + learner[3] * (1 - share[:, 0])
+        logits = self.logits((inputs[0], inputs[1], inputs[2], log_prob))
+        found = torch.autograd.grad(logits.sum(), inputs, create_graph=True, allow_unused=True)
+        gradients = torch.cat([one for one in found if one is not None], dim=1)
+        return (gradients.norm(dim=1) - 1.0).square().mean()
+
+    def _encode(self, rows: Transitions, log_probs: F32 | None) -> Batch:
+        log_prob = torch.zeros(len(rows)) if log_probs is None else torch.from_numpy(log_probs)
+        actions = torch.from_numpy(rows.actions) * self.free * (1.0 - torch.from_numpy(rows.states[:, -1:]))
+        return self._state(rows.states), actions, self._state(rows.next_states), log_prob
+
+    def _state(self, states: F32) -> Tensor:
+        given = torch.from_numpy(states)
+        x, absorbing = (given[:, :-1] - self.mean) * self.scale, given[:, -1:]
+        return torch.cat([x.clamp(-self.clamp, self.clamp) * (1.0 - absorbing), absorbing], dim=1)
+
+
+def _drawn(data: Batch, count: int, rng: np.random.Generator) -> Batch:
+    rows: I64 = rng.integers(len(data[0]), size=count)
+    index = torch.from_numpy(rows)
+    return data[0][index], data[1][index], data[2][index], data[3][index]

@@ -1,0 +1,78 @@
+"""The page that asks people to compare two films side by side: one self-contained HTML file."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from manip_il.chapter.preferences.answers import FORMAT, VERSION
+from manip_il.chapter.preferences.pairs import Clips, Pairs
+from manip_il.collect.edits import EditSource, open_source, render_states
+from manip_il.data import schema
+from manip_il.evaluation.film import encode_mp4
+from manip_il.mdp import F64
+from manip_il.sim.config import FILM, CameraConfig
+from manip_il.tasks.stock.table import ROBOTS as STOCK
+
+SIDE = 240  # edge of a film [pixels]
+MOST_FPS = 10  # films play in real time; rendering a picture takes tens of milliseconds
+_CAMERA = "front"
+
+
+Films = list[list[bytes]]  # MP4s of each pair, left and right
+
+
+def render_films(clips: Clips, robot: Path | None = None, on_pair: Callable[[], None] = lambda: None) -> Films:
+    """Return MP4s of the left and right clip of every pair.
+
+    robot: YAML of the sources' robot, if it is not a built-in one. Raises `RenderError` without off-screen OpenGL and
+    `ManipError` for sources whose states cannot be rendered.
+    """
+    pairs = clips.pairs
+    opened = [open_source(root, robot) for root in clips.roots]
+    states = [source.dataset.columns([schema.SIM_STATE])[schema.SIM_STATE] for source in opened]
+    every = -(-pairs.control_hz // MOST_FPS)
+    found: Films = []
+    for number, pair in enumerate(pairs.pairs):
+        films: list[bytes] = []
+        for side, clip in enumerate(pair):
+            rows = clips.rows[number, side] - clips.offsets[clip.source]
+            films.append(_film(opened[clip.source], states[clip.source][rows[::every]], pairs.control_hz // every))
+        found.append(films)
+        on_pair()
+    return found
+
+
+def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
+    """Return the page as one string of HTML."""
+    script = (files("manip_il.chapter.preferences") / "templates" / "ask.js").read_text(encoding="utf-8")
+    data: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "pairs": pairs.sha256,
+        "films": [[base64.b64encode(film).decode("ascii") for film in pair] for pair in films],
+    }
+    environment = Environment(
+        loader=PackageLoader("manip_il.chapter.preferences"), autoescape=True, undefined=StrictUndefined
+    )
+    return environment.get_template("ask.html.j2").render(
+        title=f"{pairs.robot} {pairs.task}",
+        instruction=instruction,
+        count=len(pairs),
+        data=data,
+        script=Markup(script),
+        script_sha256=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
+    )
+
+
+def _film(source: EditSource, states: F64, fps: float) -> bytes:
+    camera = next(iter(STOCK[source.env.robot].cameras if source.env.robot in STOCK else ()), _CAMERA)
+    pictures = render_states(source.env, CameraConfig((camera,), SIDE, SIDE, FILM), states)
+    return encode_mp4(list(pictures[schema.IMAGES + camera]), fps)

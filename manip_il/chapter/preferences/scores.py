@@ -1,0 +1,159 @@
+"""Scores of a dataset's frames and episodes by a reward, and the file of sample weights for LeRobot's RA-BC.
+
+RA-BC learns from frames after which progress rises. A frame's own score does not tell whether to learn from it, because
+failing episodes also approach the goal at first. The score at the episode's end does, so the progress written is
+
+    progress_t = t (score of the episode - bar),    bar = upper quartile of the episodes' scores - BELOW
+
+It rises throughout an episode that ends near the best quarter, and falls throughout the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from scipy.stats import mannwhitneyu
+
+from manip_il.chapter.preferences.frames import Frames
+from manip_il.data.atomic import writing
+from manip_il.data.lerobot_layout import EPISODE_INDEX
+from manip_il.evaluation.tables import Table
+from manip_il.mdp import F64
+
+FILE_NAME, WEIGHTS_FILE = "scores.json", "rabc.parquet"
+LAST = 1.0  # an episode's score is the mean over its last second [s]
+BEST, BELOW = 0.75, 0.25  # quantile of the episodes' scores, and how far below it the score of a kept episode may be
+WORST = 10  # number of episodes listed
+_METADATA = b"reward_model_path"  # the key that LeRobot's own scripts write
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Scores of a dataset. frames: score of each frame, (N,), 0 to 1; reward: the reward's name.
+
+    An episode's score is the mean over its last second: how close to success it ended.
+    """
+
+    root: str
+    reward: str
+    data: Frames
+    frames: F64
+
+    @cached_property
+    def episodes(self) -> F64:
+        """Score of each episode, (E,)."""
+        return episode_scores(self.frames, self.data)
+
+    @property
+    def bar(self) -> float:
+        """Score up to which an episode's frames have no weight: the episodes' upper quartile minus `BELOW`."""
+        return float(np.quantile(self.episodes, BEST)) - BELOW
+
+    @property
+    def succeeded(self) -> NDArray[np.bool_] | None:
+        """Whether each episode succeeded at some step, (E,); None if the dataset has no success column."""
+        if self.data.success is None:
+            return None
+        return np.logical_or.reduceat(self.data.success, self.data.firsts)
+
+    @property
+    def auc(self) -> float | None:
+        """Area under the ROC curve for detecting failed episodes by a low score; None if all or none failed."""
+        return roc_auc(self.episodes, self.succeeded)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of `scores.json`; frames' scores are in the parquet file."""
+        succeeded, bar = self.succeeded, self.bar
+        numbers = self.data.episodes[self.data.firsts].tolist()
+        episodes: list[Mapping[str, Any]] = [
+            {
+                "episode": number,
+                "frames": int(self.data.lengths[place]),
+                "score": float(self.episodes[place]),
+                "kept": bool(self.episodes[place] > bar),
+                "success": None if succeeded is None else bool(succeeded[place]),
+            }
+            for place, number in enumerate(numbers)
+        ]
+        return {
+            "dataset": self.root,
+            "reward": self.reward,
+            "auc": self.auc,
+            "bar": bar,
+            "episodes": episodes,
+        }
+
+
+def episode_scores(values: F64, frames: Frames) -> F64:
+    """Return the mean of the frames' values (N,) over the last `LAST` seconds of each episode, (E,)."""
+    last = max(1, round(LAST * frames.spec.fps))
+    ends = frames.firsts + frames.lengths
+    begins = np.maximum(frames.firsts, ends - last)
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    return (sums[ends] - sums[begins]) / (ends - begins)
+
+
+def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
+    """Return P(a failed episode's score is below a successful one's); ties count half (Mann and Whitney 1947).
+
+    scores, succeeded: one per episode, (E,). None if all or none succeeded.
+    """
+    if succeeded is None or succeeded.all() or not succeeded.any():
+        return None
+    good, bad = scores[succeeded], scores[~succeeded]
+    found: Any = mannwhitneyu(good, bad, method="asymptotic")
+    return float(found.statistic / (len(good) * len(bad)))
+
+
+def write_weights(path: Path, scores: Scores) -> None:
+    """Write the columns that LeRobot's RA-BC reads: `index`, `episode_index`, `frame_index`, `progress_sparse`.
+
+    RA-BC ignores the additional column `score`. Raises `ManipError` if the disk is full or read-only.
+    """
+    data = scores.data
+    steps = np.arange(len(scores.frames)) - np.repeat(data.firsts, data.lengths)
+    above = np.repeat(scores.episodes - scores.bar, data.lengths)
+    table = pa.table(
+        {
+            "index": np.arange(len(scores.frames), dtype=np.int64),
+            EPISODE_INDEX: data.episodes,
+            "frame_index": steps,
+            "progress_sparse": (steps * above).astype(np.float32),
+            "score": scores.frames.astype(np.float32),
+        },
+        metadata={_METADATA: scores.reward.encode()},
+    )
+    with writing(path):
+        pq.write_table(table, path)
+
+
+def worst_table(scores: Scores) -> Table:
+    """Return a table of the episodes with the lowest scores, lowest first."""
+    data, succeeded = scores.data, scores.succeeded
+    rows = tuple(
+        (
+            str(data.episodes[data.firsts[place]]),
+            f"{scores.episodes[place]:.2f}",
+            "" if succeeded is None else ("yes" if succeeded[place] else "no"),
+            f"{data.lengths[place]:,}",
+        )
+        for place in np.argsort(scores.episodes, kind="stable")[:WORST].tolist()
+    )
+    return Table(("episode", "score", "success", "frames"), rows).filled()
+
+
+def fact_lines(scores: Scores) -> list[str]:
+    """Return lines that say how many episodes are kept, and how well the score detects failed episodes."""
+    kept, count = int((scores.episodes > scores.bar).sum()), len(scores.episodes)
+    lines = [f"{kept:,} of {count:,} episodes score more than {scores.bar:.2f}; frames of the others have weight 0"]
+    if scores.auc is not None:
+        lines.append(f"area under the ROC curve for detecting failed episodes: {scores.auc:.3f}")
+    return lines

@@ -1,0 +1,143 @@
+"""Bayesian inverse reinforcement learning (Ramachandran & Amir 2007): a posterior of the weights.
+
+Prior: the weights are independent, each exponential with mean `PRIOR` [1/m]. Likelihood: the demonstrator chooses among
+its own path and those that are cheapest for some other weights ("tastes"), in proportion to exp(-w . features). All
+these paths are sensible, and better ones are more likely; the sum over them is exact, and short enough for chains of
+tens of thousands of steps. Tastes are drawn from the prior, then from the posterior, which finds paths of nearly equal
+cost. The posterior is sampled by random-walk Metropolis in log w; its steps are tuned in warm-ups, then fixed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from manip_il.mdp import F64, I64
+from manip_il.tasks.carry.paths import Demonstration, add_rivals, rivals
+
+Density = Callable[[F64], F64]  # log-densities (C,) at points (C, K)
+PRIOR = 300.0  # mean of a weight [1/m]
+TASTES = 60  # weight vectors drawn from the prior, the same for all demonstrations
+CHAINS = 4
+_ROUNDS, _MORE = 3, 30  # rounds of drawing tastes from the posterior, and tastes per round
+_DRAWS, _WARM_UP = 10_000, 2_000  # steps of a chain and of each warm-up
+_FIRST, _FITS = 0.3, 2  # initial step size, and number of warm-ups; each one tunes the steps
+_STEP = 2.38  # random walk's step in standard deviations, before division by sqrt(dimension) (Roberts et al. 1997)
+
+
+@dataclass(frozen=True)
+class Choices:
+    """The paths that the demonstrators chose among, one block of rows per demonstration.
+
+    excess: a path's features minus the demonstration's, (m, K) [m]. A block's first row, zeros, is the demonstration.
+    starts: first row of each block, (D,).
+    """
+
+    excess: F64
+    starts: I64
+
+    @classmethod
+    def of(cls, sums: Sequence[F64]) -> Choices:
+        """Return the choices, given feature sums (m, K) for each demonstration, with its own path in the first row."""
+        starts = np.cumsum([0, *map(len, sums[:-1])]).astype(np.int64)
+        return cls(np.concatenate([one - one[0] for one in sums]), starts)
+
+    def log_likelihood(self, weights: F64) -> F64:
+        """Return the log-likelihood of all demonstrated choices, (C,), for weights (C, K)."""
+        costs = self.excess @ weights.T
+        least = np.minimum.reduceat(costs, self.starts)
+        lengths = np.diff(np.append(self.starts, len(costs)))
+        sums = np.add.reduceat(np.exp(np.repeat(least, lengths, axis=0) - costs), self.starts)
+        return (least - np.log(sums)).sum(axis=0)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Draws of the weights from C chains. draws: (C, N, K) [1/m]."""
+
+    draws: F64
+
+    @property
+    def pooled(self) -> F64:
+        """All chains' draws, (C * N, K) [1/m]."""
+        return self.draws.reshape(-1, self.draws.shape[2])
+
+    @property
+    def mean(self) -> F64:
+        """Posterior mean of the weights, (K,) [1/m]. The cheapest path for the mean has the least expected cost."""
+        return self.pooled.mean(axis=0)
+
+    @property
+    def agreement(self) -> F64:
+        """Split R-hat of the log-weights, (K,); 1 if the chains agree (Gelman et al. 2013, 11.4)."""
+        points = np.log(self.draws)
+        half = points.shape[1] // 2
+        parts = np.concatenate([points[:, :half], points[:, half : 2 * half]])
+        within = parts.var(axis=1, ddof=1).mean(axis=0)
+        between = parts.mean(axis=1).var(axis=0, ddof=1)
+        return np.sqrt((half - 1) / half + between / np.maximum(within, np.finfo(float).tiny))
+
+    def ratios(self, base: int, level: float) -> F64:
+        """Return the credible intervals, (K, 2), of each weight's ratio to the weight of feature `base`."""
+        ratios = self.pooled / self.pooled[:, [base]]
+        return np.quantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T
+
+    def thin(self, count: int) -> F64:
+        """Return evenly spaced draws, (count, K)."""
+        return self.pooled[np.linspace(0, len(self.pooled) - 1, count).round().astype(np.int64)]
+
+
+def prior_tastes(count: int, features: int, rng: np.random.Generator, prior: float = PRIOR) -> F64:
+    """Return weight vectors drawn from the prior, (count, features) [1/m]."""
+    return rng.exponential(prior, (count, features))
+
+
+def fit(demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR) -> Posterior:
+    """Return the posterior, given that each demonstration was chosen over the cheapest paths for sampled weights."""
+    features = demonstrations[0].problem.features.shape[1]
+    sums = rivals(demonstrations, prior_tastes(TASTES, features, rng, prior))
+    for _ in range(_ROUNDS):
+        quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 5, _WARM_UP)
+        sums = add_rivals(demonstrations, sums, quick.thin(_MORE))
+    return draw_posterior(Choices.of(sums), rng, prior)
+
+
+def draw_posterior(
+    choices: Choices,
+    rng: np.random.Generator,
+    prior: float = PRIOR,
+    count: int = _DRAWS,
+    warm_up: int = _WARM_UP,
+    chains: int = CHAINS,
+) -> Posterior:
+    """Return draws of the weights given the choices. prior: mean of a weight [1/m]. count: draws per chain."""
+
+    def density(logs: F64) -> F64:
+        weights = np.exp(logs)
+        return choices.log_likelihood(weights) - weights.sum(axis=1) / prior + logs.sum(axis=1)  # d w = w d log w
+
+    size = choices.excess.shape[1]
+    start, root = np.log(prior * rng.uniform(0.5, 1.5, (chains, size))), _FIRST * np.eye(size)
+    for _ in range(_FITS):
+        tried = sample(density, start, root, warm_up, rng)[:, warm_up // 2 :]
+        start, root = tried[:, -1], _STEP / np.sqrt(size) * np.linalg.cholesky(np.cov(tried.reshape(-1, size).T))
+    return Posterior(np.exp(sample(density, start, root, count, rng)))
+
+
+def sample(density: Density, start: F64, root: F64, count: int, rng: np.random.Generator) -> F64:
+    """Return `count` draws, (C, count, K), from each chain; the chains start at `start` (C, K).
+
+    root: Cholesky factor of the steps' covariance, (K, K).
+    """
+    chains, size = start.shape
+    now, height = start, density(start)
+    points = np.empty((chains, count, size))
+    for step in range(count):
+        proposed = now + rng.standard_normal((chains, size)) @ root.T
+        there = density(proposed)
+        accept = np.log(rng.random(chains)) < there - height
+        now, height = np.where(accept[:, None], proposed, now), np.where(accept, there, height)
+        points[:, step] = now
+    return points
