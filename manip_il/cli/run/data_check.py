@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from manip_il.bridges.doctor.examine import examine_folder, repair
-from manip_il.bridges.doctor.finding import Finding, NotWhole, warning
+from manip_il.bridges.doctor.files import Finding, warning
 from manip_il.cli.data_check import CheckOptions, RepairOptions
 from manip_il.cli.progress import say
 from manip_il.cli.run.inputs import differences
@@ -15,13 +15,13 @@ from manip_il.errors import ManipError
 
 
 def run_check(options: CheckOptions) -> None:
-    """Check the dataset and print every finding and the verdict; raises `NotWhole` if there are errors."""
+    """Check the dataset and print every finding and the verdict; raises `ManipError` if there are errors."""
     _conclude(options, _examine(options))
 
 
-def _examine(options: CheckOptions, *, repaired: bool = False) -> list[Finding]:
+def _examine(options: CheckOptions) -> list[Finding]:
     """Check the dataset and print every finding."""
-    findings = examine_folder(options.dataset.absolute(), [check_robot], repaired=repaired)
+    findings = examine_folder(options.dataset.absolute(), [check_robot])
     say(*map(str, findings))
     return findings
 
@@ -29,16 +29,16 @@ def _examine(options: CheckOptions, *, repaired: bool = False) -> list[Finding]:
 def _conclude(options: CheckOptions, findings: list[Finding]) -> None:
     errors = sum(finding.is_error for finding in findings)
     if errors:
-        raise NotWhole(f"{options.dataset}: errors: {errors}, warnings: {len(findings) - errors}")
+        raise ManipError(f"{options.dataset}: errors: {errors}, warnings: {len(findings) - errors}")
     info = Dataset.open(options.dataset).info
     say(f"{options.dataset}: {info.episodes:,} episodes, {info.frames:,} frames: whole; warnings: {len(findings)}")
 
 
 def run_repair(options: RepairOptions) -> None:
-    """Check, repair, check again, and print the verdict; raises `NotWhole` if errors remain."""
+    """Check, repair, check again, and print the verdict; raises `ManipError` if errors remain."""
     if findings := _examine(options):
         say(*(f"repair   {line}" for line in repair(options.dataset.absolute(), findings)))
-        findings = _examine(options, repaired=True)
+        findings = _examine(options)
     _conclude(options, findings)
 
 
