@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from manip_il import checks
-from manip_il.bridges.mcap.read import read_messages, read_topics
+from manip_il.bridges.mcap.importing import read_messages
 from manip_il.bridges.store.manifest import File
 from manip_il.data.camera import open_video
 from manip_il.data.journal import read_journal
@@ -62,7 +62,6 @@ def hide(path: Path, kind: str) -> None:
         lambda path: checks.read_yaml(path, "an x"),
         read_lines,
         read_journal,
-        read_topics,
         lambda path: list(read_messages(path, ["/a"])),
         open_video,
         lambda path: read_file(path, ["x"]),

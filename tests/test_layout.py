@@ -87,7 +87,7 @@ def test_other_code_is_found_by_the_packages_own_tables_alone():
         ("cli/main.py", "load"),
         ("cli/main.py", "run"),
         ("learn/lerobot_config.py", "policy_types"),
-        ("bridges/mcap/read.py", "read_messages"),
+        ("bridges/mcap/importing.py", "read_messages"),
         ("option.py", "type_of"),
         ("sim/render.py", "_context"),
     }

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 
-from manip_il.bridges.mcap.mapping import Mapping, TopicSource, load_mapping
-from manip_il.bridges.mcap.path import values_at
+from manip_il.bridges.mcap.mapping import Mapping, TopicSource, load_mapping, values_at
 from manip_il.errors import ManipError, UsageError
 
 from .use import load

@@ -8,6 +8,6 @@
 - Every file is first read in a child process with limited memory and time. Messages are protobuf, JSON or, with the
   package mcap-ros2-support, ROS 2 (cdr); chunks are zstd, lz4 or uncompressed.
 
-`export` writes the channels of `data.foxglove`. `importing` resamples the messages that `read` decodes, with a
-`mapping` of columns to topics and `path`s of fields.
+`export` writes the channels of `data.foxglove`. `importing` reads and resamples messages, with a `mapping` of columns
+to topics and fields.
 """

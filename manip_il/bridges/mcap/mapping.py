@@ -1,33 +1,53 @@
-"""Mapping files of an import: the topics and fields of every column. `configs/mcap/panda.yaml` explains one."""
+"""Mapping files of an import: the topics and fields of every column. `configs/mcap/panda.yaml` explains one.
+
+A field is a path in a message: `pose.position.x`, `data[0]`, `scalars[:].value`, `joints[name=elbow].position`. `[:]`
+selects every element of a list, `[name=elbow]` the one whose name is elbow. A name may have any characters except dots
+and square brackets, the text after `=` any except a closing bracket.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import draccus
+from google.protobuf.message import Message
 
 from manip_il import checks
-from manip_il.bridges.mcap.path import check_path
 from manip_il.data.info import INDEX_FEATURES, NUMBERS
 from manip_il.data.schema import MOST_FPS
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError, UsageError, nearest
 
 TEXT = "string"  # LeRobot's dtype for text
 TASK = "task"  # key of a frame's task text
+_NAME = r"[^.\[\]]+"
+_SELECTOR = r"\[(:|\d+|[^=\]]+=[^\]]+)\]"
+_PATH = re.compile(rf"{_NAME}(\.{_NAME}|{_SELECTOR})*")
+_STEP = re.compile(rf"{_SELECTOR}|({_NAME})")
 
 
 @dataclass(frozen=True)
 class TopicSource:
-    """A column's topic, and which message is used in a frame. tolerance: largest time from frame to message [s].
+    """A column's topic, and which message is used in a frame.
 
-    resample: `nearest` in time (of two equally near, the earlier one), or `previous`, the last one not after the frame.
-    field: paths to a message's numbers or text, joined in order. shape: that of the joined values, by default a vector.
-    video: for cameras, instead of `field`; true stores lossy video, false PNG. Raises `UsageError` for options that
-    contradict each other.
+    Args:
+        topic: The topic's name.
+        resample: `nearest` in time (of two equally near, the earlier one), or `previous`, the last one not after the
+            frame.
+        tolerance: Largest time from frame to message [s].
+        field: Paths to a message's numbers or text, joined in order.
+        dtype: LeRobot's name for the type of the values.
+        names: The values' names in `info.json`.
+        shape: Shape of the joined values, by default a vector.
+        video: For cameras, instead of `field`; true stores lossy video, false PNG.
+
+    Raises:
+        UsageError: Options contradict each other.
     """
 
     topic: str
@@ -42,14 +62,16 @@ class TopicSource:
     def __post_init__(self) -> None:
         checks.text("topic", self.topic, checks.LONGEST_NAME)
         if self.is_camera == bool(self.paths):
-            raise UsageError("expected either field or video")
+            raise UsageError(f"{self.topic}: expected either field or video")
         if self.dtype not in (*NUMBERS, TEXT):
-            raise UsageError(f"dtype is {self.dtype}; expected one of {', '.join((*NUMBERS, TEXT))}")
-        if not 0 <= self.tolerance < math.inf:
-            raise UsageError(f"tolerance is {self.tolerance}; expected seconds, 0 or more")
+            raise UsageError(f"{self.topic}: dtype is {self.dtype}; expected one of {', '.join((*NUMBERS, TEXT))}")
+        checks.number(f"{self.topic}: tolerance", self.tolerance, 0)
         for path in self.paths:
-            check_path(path)
-        checks.text("names", json.dumps(self.names, ensure_ascii=False), checks.LARGEST_YAML)  # info.json holds them
+            if not _PATH.fullmatch(path):
+                expected = "names and selectors, as in joints[name=elbow].position, scalars[:].value, data[0]"
+                raise UsageError(f"{self.topic}: the path {path!r} is invalid; expected {expected}")
+        # info.json holds them
+        checks.text("names", json.dumps(self.names, ensure_ascii=False), checks.LARGEST_YAML)
 
     @property
     def is_camera(self) -> bool:
@@ -71,7 +93,14 @@ class TopicSource:
 
 @dataclass(frozen=True)
 class Mapping:
-    """How topics become a dataset. task: one text for all frames, or the topic that holds the texts."""
+    """How topics become a dataset.
+
+    Args:
+        fps: The dataset's rate [frames/s].
+        task: One text for all frames, or the topic that holds the texts.
+        features: The columns.
+        robot_type: The robot's name in the dataset.
+    """
 
     fps: float
     task: str | TopicSource
@@ -80,7 +109,6 @@ class Mapping:
 
     def __post_init__(self) -> None:
         checks.number("fps", self.fps, 1, MOST_FPS)
-        checks.text("robot_type", self.robot_type or "", checks.LONGEST_NAME)
         if not self.features:
             raise UsageError("features is empty; expected at least one column")
         for key in self.features:
@@ -95,21 +123,54 @@ class Mapping:
 
 
 def load_mapping(path: Path) -> Mapping:
-    """Read a mapping file. Raises `UsageError` naming file, column and key."""
+    """Read a mapping file. Raises `UsageError` naming file, column or topic, and key."""
     try:
         tree = checks.mapping("a mapping", checks.read_yaml(path, "a mapping file"))
-        table = checks.mapping("features", tree.get("features"))
-        features = {key: _source(f"features: {key}", value) for key, value in table.items()}
-        task = tree.get("task")
-        task = _source("task", task | {"dtype": TEXT}) if isinstance(task, dict) else checks.text("task", task)
-        given: dict[str, Any] = {**tree, "features": features, "task": task}
-        return Mapping(**given)
-    except (ManipError, TypeError) as error:  # a TypeError names an unknown or missing key
-        raise UsageError(f"{path}: {error}") from error
-
-
-def _source(what: str, table: Any) -> TopicSource:
-    try:
-        return draccus.decode(TopicSource, checks.mapping("it", table))
+        checks.text("robot_type", tree.get("robot_type") or "", checks.LONGEST_NAME)
+        task = tree.get(TASK)
+        if isinstance(task, dict):
+            task = draccus.decode(TopicSource, task | {"dtype": TEXT})
+        else:
+            checks.text(TASK, task)
+        return replace(draccus.decode(Mapping, tree | {TASK: ""}), task=task)
     except (ManipError, draccus.ParsingError) as error:
-        raise UsageError(f"{what}: {checks.one_line(error)}") from error
+        raise UsageError(f"{path}: {checks.one_line(error)}") from error
+
+
+def values_at(path: str, message: Any) -> list[Any]:
+    """Return the values at a path, in order; if it ends at a list, the list's elements.
+
+    message: a protobuf or ROS 2 message, or parsed JSON. Raises `ManipError` naming the part of `path` that is missing.
+    """
+    nodes = [message]
+    for selector, name in _STEP.findall(path):
+        nodes = [value for node in nodes for value in (_select(node, selector) if selector else [_field(node, name)])]
+    return [value for node in nodes for value in (node if _is_list(node) else [node])]
+
+
+def _select(node: Any, selector: str) -> Sequence[Any]:
+    if not _is_list(node):
+        raise ManipError(f"[{selector}] is applied to something that is not a list")
+    if selector == ":":
+        return node
+    key, is_named, text = selector.partition("=")
+    found = node[int(key) :][:1] if not is_named else [value for value in node if str(_field(value, key)) == text]
+    if len(found) != 1:
+        raise ManipError(f"[{selector}] matches {len(found)} of {len(node)} elements; expected one")
+    return found
+
+
+def _field(node: Any, name: str) -> Any:
+    known: Any = node if isinstance(node, dict) else getattr(node, "__slots__", ())  # ROS messages have slots
+    if isinstance(node, Message):
+        known = node.DESCRIPTOR.fields_by_name
+    if name not in known:
+        kind = " in a list; select elements by [0], [:] or [name=...]" if _is_list(node) else ""
+        raise ManipError(f"no field {name!r}{kind}{nearest(name, known)}; known: {', '.join(known) or 'none'}")
+    if isinstance(node, Message) and known[name].has_presence and not node.HasField(name):
+        raise ManipError(f"{name} is not set in this message")  # protobuf would return zeros
+    return node[name] if isinstance(node, dict) else getattr(node, name)
+
+
+def _is_list(node: Any) -> bool:
+    return isinstance(node, Sequence) and not isinstance(node, str | bytes)
