@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 from huggingface_hub import DatasetCard, ModelCard
 
-from manip_il.bridges.store.cards import write_cards
+from manip_il.bridges.store.hub import write_cards
 from manip_il.data.dataset import Dataset
+from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.lerobot_layout import OURS
 from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import Origin
@@ -87,10 +88,11 @@ def test_a_policys_card_is_of_its_best_policy_and_says_how_well_it_does(tmp_path
     write_checkpoint(run / "best" / "pretrained_model", "act", spec, origin=meta)
     assert "not measured" in cards(run, "policy", "user/act")[CARD].decode()
     better = EVALUATION | {"success_rate": 0.97, "n_episodes": 500}
-    others = {"easy": better | {"settings": {"suite": "easy"}}, "round_0": better | {"policy_sha256": "another"}}
-    for place, more in {"eval": {}, "validation/3": better, **others}.items():
+    others = {"easy": better | {"settings": {"suite": "easy"}}, "other": better | {"policy_sha256": "another"}}
+    own = EVALUATION | {"policy_sha256": policy_sha256(run / "best" / "pretrained_model")}
+    for place, more in {"eval": {}, "validation/3": better, "round_1": better, **others}.items():
         (run / place).mkdir(parents=True)
-        (run / place / "eval.json").write_text(json.dumps(EVALUATION | more))
+        (run / place / "eval.json").write_text(json.dumps(own | more))
     text = cards(run, "policy", "user/act")[CARD].decode()
     data = ModelCard(text).data.to_dict()
     assert (data["license"], data["library_name"], data["pipeline_tag"]) == ("apache-2.0", "lerobot", "robotics")

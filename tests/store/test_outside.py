@@ -16,8 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from s3fs import S3FileSystem
 
-from manip_il.bridges.store.arrival import Arrival
-from manip_il.bridges.store.manifest import Manifest
+from manip_il.bridges.store.manifest import Arrival, Manifest
 from manip_il.bridges.store.transfer import open_remote, pull, push
 from manip_il.cli.main import main
 from manip_il.errors import ManipError

@@ -11,13 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.bridges.doctor.finding import NotWhole
 from manip_il.bridges.store.errors import RemoteError
 from manip_il.bridges.store.manifest import MANIFEST_FILE
 from manip_il.bridges.store.objects import Objects
 from manip_il.bridges.store.transfer import open_remote, pull, push
 from manip_il.data.dataset import Dataset
-from manip_il.errors import FolderExistsError, UsageError
+from manip_il.errors import FolderExistsError, ManipError, UsageError
 
 from ..learn.tiny_policies import write_checkpoint
 from .conftest import DATASET, POLICY, SAMPLE, content, make_run
@@ -76,7 +75,7 @@ def test_s3_itself_refuses_a_manifest_that_replaces_another_than_was_read(bucket
     answers = iter([older, found])
     monkeypatch.setattr(remote, "read", lambda: next(answers))
     with pytest.raises(RemoteError, match="changed by another push"):
-        remote._switch(older, older)
+        remote._switch(older, older.version)
 
 
 def test_journals_go_along_when_asked_and_lie_beside_again(tmp_path: Path):
@@ -191,7 +190,7 @@ def test_a_dataset_is_examined_before_its_push_and_links_are_not_followed(tmp_pa
     (broken / "data/chunk-000/file-000.parquet").write_bytes(b"PAR1")
     (tmp_path / "run" / "config.yaml").write_text("")
     for folder in (broken, broken.parent):
-        with pytest.raises(NotWhole, match=r"is damaged and was not pushed.*manip-il data repair"):
+        with pytest.raises(ManipError, match=r"is damaged and was not pushed.*manip-il data check"):
             push(folder, open_quietly(f"file://{tmp_path}/store"))
     shutil.rmtree(broken)
     (broken.parent / "secret.txt").symlink_to("/etc/passwd")

@@ -1,39 +1,58 @@
-"""A repository on the Hugging Face Hub, or the server at HF_ENDPOINT, through huggingface_hub.
+"""A repository on the Hugging Face Hub, or the server at HF_ENDPOINT, through huggingface_hub; its card.
 
 Files keep their paths, so that LeRobot reads them. A push is one commit on top of the version that the folder was
 compared with; then the tag `v3.0`, by which LeRobot finds datasets, is moved to that commit. The Hub provides the size
 and hash of each file of a commit; a manifest lists those that a push wrote, since a repository may hold others.
+
+The card, `README.md`, is made from `card.md.jinja`. It holds no absolute path, token or date, so that the same folder
+gives the same bytes. A card of another program's dataset or policy claims neither our licence nor our authorship.
 """
 
 from __future__ import annotations
 
 import re
+import shlex
 import tempfile
 from collections.abc import Collection, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import httpx
+import jinja2
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, RepoFile, constants, set_client_factory
 from huggingface_hub.errors import RemoteEntryNotFoundError, RepositoryNotFoundError, RevisionNotFoundError
 from huggingface_hub.utils import disable_progress_bars
 from huggingface_hub.utils._http import default_client_factory
 
 from manip_il import checks
-from manip_il.bridges.store.arrival import Arrival
-from manip_il.bridges.store.cards import write_cards
-from manip_il.bridges.store.errors import SENT, RemoteError, explained
-from manip_il.bridges.store.manifest import CARD, CONFIG, MANIFEST_FILE, File, Kind, Manifest, PushPlan, policy_folder
+from manip_il.bridges.store.errors import SENT, RemoteError, explained, redact
+from manip_il.bridges.store.manifest import (
+    CARD,
+    CONFIG,
+    MANIFEST_FILE,
+    Arrival,
+    File,
+    Kind,
+    Manifest,
+    PushPlan,
+    policy_folder,
+)
+from manip_il.data.dataset import Dataset
+from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.lerobot_layout import VERSION
-from manip_il.errors import UsageError
+from manip_il.errors import ManipError, UsageError
+from manip_il.sim.conditions import NOMINAL
+from manip_il.tasks import ENV_IDS
 
 _ADDRESS = re.compile(r"(datasets/|models/)?((?!datasets/|models/)\w[\w.-]*/\w[\w.-]*)(?:@(\w[\w./-]*))?")
 _HIDDEN = re.compile(r"(.*/)?\.[^./]")  # such as the Hub's own .gitattributes
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _OF_A_DATASET = ("data/", "meta/", "videos/")  # the layout's folders, which are replaced as one
+_OURS = b"<!-- written by manip-il push -->"  # a card with this line is ours and is replaced
 _ANSWERS = ContextVar[Arrival | None]("_ANSWERS", default=None)  # of the action in progress
 
 
@@ -95,8 +114,9 @@ class Hub:
         self._private = private
         self._repo: Any = {"repo_id": self._place, "repo_type": "dataset" if self.kind == "dataset" else "model"}
         self.name = f"hf://{found[1] or ''}{self._place}{f'@{self._revision}' if self._revision else ''}"
+        self.quiet = quiet
         _use_client()
-        self._api, self.quiet = HfApi(library_name="manip_il"), quiet
+        self._api = HfApi(library_name="manip_il")
         if quiet:
             disable_progress_bars()
 
@@ -109,22 +129,26 @@ class Hub:
                 return None
             head = about.sha or ""
             if not _COMMIT.fullmatch(head):  # becomes part of paths
-                found = f"the commit {checks.shorten(head)}, not 40 hexadecimal digits"
-                raise RemoteError(f"{self.name} has {found}; is HF_ENDPOINT a Hub?")
+                raise RemoteError(f"{self.name} names the commit {checks.shorten(head)}; is HF_ENDPOINT a Hub?")
             tree = self._api.list_repo_tree(**self._repo, revision=head, recursive=True)
-            listed = {one.path: one for one in tree if isinstance(one, RepoFile)}
-            missing = sorted({one.rfilename for one in getattr(about, "siblings", None) or ()} - listed.keys())
-            if missing:
-                text = f"its list of files lacks {checks.shorten(missing[0])}, which the commit has; try again"
+            listed = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
+            if missing := {entry.rfilename for entry in about.siblings or ()} - listed.keys():
+                text = f"its list of files lacks {checks.shorten(min(missing))}, which the commit has; try again"
                 raise RemoteError(f"{self.name}: {text}")
             files = {
-                path: File(one.lfs.size, one.lfs.sha256) if one.lfs else File(one.size, git_sha1=one.blob_id)
-                for path, one in listed.items()
+                path: File(entry.lfs.size, entry.lfs.sha256) if entry.lfs else File(entry.size, git_sha1=entry.blob_id)
+                for path, entry in listed.items()
                 if not _HIDDEN.match(path) and path != MANIFEST_FILE
             }
-            copies = root_copies(files) if self.kind == "policy" else {}
+            copies = self._copies(files)
             are_equal = all(files.get(name) == files[path] for name, path in copies.items())
             return Manifest(self.kind, files, head, copies=frozenset(copies if are_equal else ()))
+
+    def _copies(self, paths: Collection[str]) -> dict[str, str]:
+        """Return which files of a run's policy are copied to the root, name -> path."""
+        folder = policy_folder(path for path in paths if path != CONFIG) if self.kind == "policy" else None
+        inside = {Path(path).name: path for path in paths if folder and str(Path(path).parent) == folder}
+        return {name: path for name, path in inside.items() if name != CARD}
 
     def pushed(self, before: Manifest) -> dict[str, File]:
         """Return the files of a version that a push wrote, by its manifest in the repository, without an edited card.
@@ -157,7 +181,7 @@ class Hub:
         added = write_cards(source, self.kind, self._place, folder)
         if keeps and added.pop(CARD, None):
             local = {path: file for path, file in local.items() if path != CARD}
-        copies = root_copies(local) if self.kind == "policy" else {}
+        copies = self._copies(local)
         if not copies.keys() & local.keys():
             added |= {name: local[path] for name, path in copies.items()}
         return {**local, **added}
@@ -181,12 +205,12 @@ class Hub:
 
     def download(self, manifest: Manifest, folder: Path, path: str) -> None:
         """Download a file of a version to the same path in a folder, without checking its hash."""
-        where: Any = {**self._repo, "revision": manifest.version, "local_dir": folder}
         file = manifest.files.get(path)
         most = file.size if file else checks.LARGEST_READ
-        bounded: Any = Arrival(most)  # some servers send a file by other means than answers
+        where: Any = {**self._repo, "revision": manifest.version, "local_dir": folder}
+        where["tqdm_class"] = Arrival(most)  # some servers send a file by other means than answers
         with _bounded(most):
-            self._api.hf_hub_download(filename=path, force_download=True, tqdm_class=bounded, **where)
+            self._api.hf_hub_download(filename=path, force_download=True, **where)
 
     def _create(self) -> Manifest:
         """Create the repository and the branch; return the branch's content: empty, or as on the main branch."""
@@ -201,16 +225,61 @@ class Hub:
     def _move_tag(self) -> None:
         """Delete LeRobot's tag and create it again on the main branch, because the Hub cannot move tags."""
         refs = self._api.list_repo_refs(**self._repo)
-        head = next(one.target_commit for one in refs.branches if one.name == "main")
-        tag = next((one.target_commit for one in refs.tags if one.name == VERSION), None)
-        if tag not in (None, head):
-            self._api.delete_tag(**self._repo, tag=VERSION)
-        if tag != head:
+        [head] = [branch.target_commit for branch in refs.branches if branch.name == "main"]
+        tags = [tag.target_commit for tag in refs.tags if tag.name == VERSION]
+        if tags != [head]:
+            if tags:
+                self._api.delete_tag(**self._repo, tag=VERSION)
             self._api.create_tag(**self._repo, tag=VERSION, revision=head, exist_ok=True)
 
 
-def root_copies(paths: Collection[str]) -> dict[str, str]:
-    """Return which files of a run's policy are copied to the root, name -> path; {} for a policy without a run."""
-    folder = policy_folder(path for path in paths if path != CONFIG)
-    inside = {path.removeprefix(f"{folder}/"): path for path in paths if folder and path.startswith(f"{folder}/")}
-    return {name: path for name, path in inside.items() if "/" not in name and name != CARD}
+def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, Path]:
+    """Write a card; return it by its path in the repository, or {} if `root` has one that is not ours.
+
+    Args:
+        root: A dataset, run or policy.
+        kind: Which of them.
+        place: USER/NAME.
+        folder: Where the card is written.
+
+    Raises:
+        ManipError: The folder cannot be read.
+    """
+    if (root / CARD).is_file() and _OURS not in checks.read_bytes(root / CARD, "a card"):
+        return {}
+    environment = jinja2.Environment(finalize=_shown)
+    environment.filters["word"] = lambda value: shlex.quote(_shown(str(value)))
+    environment.filters["cell"] = lambda value: " ".join(str(value).split()).replace("|", "\\|")
+    template = Path(__file__).with_name("card.md.jinja").read_text(encoding="utf-8")
+    with explained(f"write a card of {root}"):  # its JSON files may hold any values
+        facts = {"dataset": Dataset.open(root)} if kind == "dataset" else policy_facts(root)
+        about = {"place": place, "version": version("manip_il"), "env_ids": ENV_IDS}
+        text = environment.from_string(template).render(facts, **about)
+    (folder / CARD).write_text(f"{text}\n", encoding="utf-8")
+    return {CARD: folder / CARD}
+
+
+def _shown(value: Any) -> Any:
+    """Return a value as a card shows it: text on one line, without secrets."""
+    return redact(" ".join(value.splitlines())) if isinstance(value, str) else value
+
+
+def policy_facts(root: Path) -> dict[str, Any]:
+    """Return the template's values for a policy or its run. Raises `ManipError` if there is no policy."""
+    inside = policy_folder(path.relative_to(root).as_posix() for path in root.rglob(CONFIG))
+    if inside is None:
+        raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")
+    facts: dict[str, Any] = {}
+    for name in ("config", "manip_il", "train_config"):
+        path = root / inside / f"{name}.json"
+        facts[name] = checks.read_json(path, "JSON") if path.is_file() else {}
+    own = policy_sha256(root / inside)
+    evaluations = [  # of this policy, undisturbed, and not on the seeds that chose it
+        result
+        for path in root.rglob("eval.json")
+        if not any(part.startswith(("round_", "validation")) for part in path.relative_to(root).parts)
+        and (result := checks.read_json(path, "JSON")).get("policy_sha256") == own
+        and result.get("settings", {}).get("suite", NOMINAL.name) == NOMINAL.name
+    ]
+    facts["evaluation"] = max(evaluations, key=lambda result: result["n_episodes"], default={})
+    return facts

@@ -1,4 +1,4 @@
-"""The files of one version of a dataset or run, with sizes and hashes, and their JSON form."""
+"""The files of one version of a dataset or run, with sizes and hashes; what arrives of them is counted."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, override
+
+from fsspec.callbacks import Callback
 
 from manip_il import checks
-from manip_il.bridges.doctor.finding import journals_of
+from manip_il.bridges.doctor.files import journals_of
 from manip_il.bridges.store.errors import RemoteError
 from manip_il.data.lerobot_layout import INFO
 
@@ -20,7 +22,8 @@ MANIFEST_FILE = "manip_il_manifest.json"
 JOURNALS = "journals"  # name of a folder of journals, in a pushed dataset or anywhere in a run
 CHECKPOINTS, LAST = "checkpoints", "last"  # the link `last` to the newest checkpoint is not pushed; a pull creates it
 CARD, CONFIG = "README.md", "config.json"  # the first once per repository, the second once per policy
-_CHECKPOINT = re.compile(rf"{CHECKPOINTS}/(\d+)/pretrained_model")
+_POLICIES = ("pretrained_model", "best/pretrained_model")
+_CHECKPOINT = re.compile(rf"{CHECKPOINTS}/\d+/pretrained_model")
 _LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
 _DATA = re.compile(  # names of files that hold data; all others could be code, or pickles, which can run code
     r".*\.(json|jsonl|ya?ml|toml|txt|md|csv|tsv|log|html|pdf|png|jpe?g|gif|webp|svg|mp4|parquet|arrow|mcap|safetensors|"
@@ -111,15 +114,37 @@ class PushPlan:
     remove: list[str]
 
 
+class Arrival(Callback):
+    """Counts the bytes of one file. Raises `RemoteError` as soon as they are more than `most`.
+
+    fsspec updates it as a callback. huggingface_hub calls it for a new progress bar, and updates that.
+    """
+
+    def __init__(self, most: int):
+        super().__init__()
+        self.most = most
+
+    @override
+    def call(self, *hook: Any, **given: Any) -> None:
+        """Raise `RemoteError` if there are too many bytes."""
+        if self.value > self.most:
+            raise RemoteError(f"it sends more than the {self.most:,} bytes that were expected; nothing was kept")
+
+    def __call__(self, *given: Any, **options: Any) -> Arrival:
+        """Return the bar, for huggingface_hub."""
+        return self
+
+    def update(self, count: float | None = 1) -> None:
+        """Count more bytes."""
+        self.relative_update(int(count or 0))
+
+
 def check_path(path: object) -> None:
     """Raise `RemoteError` for a path that leads outside its folder, is hidden, or is not of a known kind of data."""
     parts = path.split("/") if isinstance(path, str) and path.isprintable() and "\\" not in path else [""]
-    text = "only files of data are pushed and pulled (such as .json, .parquet, .safetensors), no pickles and no code"
-    if not all(part and not part.startswith(".") for part in parts):
-        text = "expected a relative path inside the folder, without hidden files"
-    elif _DATA.fullmatch(parts[-1]):
-        return
-    raise RemoteError(f"the file {checks.shorten(path)} is refused; {text}")
+    if not all(part and not part.startswith(".") for part in parts) or not _DATA.fullmatch(parts[-1]):
+        expected = "the relative path of a file of data (such as .json, .parquet, .safetensors), no pickle, no code"
+        raise RemoteError(f"the file {checks.shorten(path)} is refused; expected {expected}, not hidden")
 
 
 def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, Path]:
@@ -134,7 +159,7 @@ def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, P
         if any(map(_LEFT_OUT.fullmatch, parts)) or (JOURNALS in parts[:-1] and not journals):
             continue
         if path.is_symlink():
-            if path.name != LAST or os.readlink(path) != newest(path.parent):
+            if parts[-2:] != (CHECKPOINTS, LAST):
                 raise RemoteError(f"{path} is a link; links are not pushed: replace it with the file itself")
         elif path.is_file():
             local["/".join(parts)] = path
@@ -149,18 +174,11 @@ def datasets_in(folder: Path) -> list[Path]:
     return sorted(root for root in found if not any(map(_LEFT_OUT.fullmatch, root.relative_to(folder).parts)))
 
 
-def newest(checkpoints: Path) -> str | None:
-    """Return the name of the newest checkpoint in a run's `checkpoints`; None for other or empty folders."""
-    steps = [path.name for path in checkpoints.iterdir() if path.name.isdecimal() and path.is_dir()]
-    return max(steps, key=int, default=None) if checkpoints.name == CHECKPOINTS else None
-
-
 def policy_folder(paths: Iterable[str]) -> str | None:
     """Return the folder of a run's policy, given the paths of the run's files: "" for the root, None if there is none.
 
     The policy is the best one, if the run has chosen one, else that of the newest checkpoint.
     """
     folders = {path.rpartition("/")[0] for path in paths if path.rpartition("/")[2] == CONFIG}
-    steps = sorted((int(found[1]), folder) for folder in folders if (found := _CHECKPOINT.fullmatch(folder)))
-    order = ("", "pretrained_model", "best/pretrained_model", *(folder for _, folder in reversed(steps)))
-    return next((folder for folder in order if folder in folders), None)
+    steps = sorted(filter(_CHECKPOINT.fullmatch, folders), reverse=True)
+    return next((one for one in ("", *_POLICIES, *steps) if one in folders), None)

@@ -14,7 +14,6 @@ import logging
 import re
 import secrets
 import tempfile
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
@@ -29,9 +28,8 @@ from fsspec.implementations.local import LocalFileSystem
 from fsspec.implementations.sftp import SFTPFileSystem
 
 from manip_il import checks
-from manip_il.bridges.store.arrival import Arrival
 from manip_il.bridges.store.errors import RemoteError, explained
-from manip_il.bridges.store.manifest import MANIFEST_FILE, File, Kind, Manifest, PushPlan
+from manip_il.bridges.store.manifest import MANIFEST_FILE, Arrival, Kind, Manifest, PushPlan
 from manip_il.errors import UnknownName, UsageError
 
 TIMEOUT = 30.0  # for connecting to an ssh server, and for each response [s]
@@ -41,8 +39,9 @@ _OPTIONS: dict[str, dict[str, Any]] = {"file": {"auto_mkdir": True}, "s3": _S3, 
 _SFTP = re.compile(
     r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)(:[1-5]?\d{1,4}|:6[0-4]\d{3}|:65[0-4]\d{2}|:655[0-2]\d|:6553[0-5])?/[^@]+"
 )
-_AT_ONCE, _LARGE_AT_ONCE = 10, 4  # concurrent files; s3fs has ten connections, and keeps parts of large ones in memory
-_LARGE = 10_000_000  # [bytes]
+# concurrent files; s3fs has ten connections, and keeps up to 200 MB of every file in memory that it sends
+_AT_ONCE = 10
+_SENT_AT_ONCE = 5
 _CHUNK = 2**20  # [bytes]
 
 
@@ -76,8 +75,6 @@ class Sftp(SFTPFileSystem):
             unquote(login.get("password") or "") or None,
             key_filename=known.get("identityfile"),
             timeout=TIMEOUT,
-            banner_timeout=TIMEOUT,
-            auth_timeout=TIMEOUT,
         )
         self.ftp = self.client.open_sftp()
         self.ftp.get_channel().settimeout(TIMEOUT)  # pyright: ignore[reportOptionalMemberAccess]
@@ -144,10 +141,6 @@ class Objects:
                 data = arrived.read()
             return Manifest.from_json(data, info.get("ETag") or hashlib.sha256(data).hexdigest())
 
-    def pushed(self, before: Manifest) -> Mapping[str, File]:
-        """Return the files of a version that a push wrote: all of them."""
-        return before.files
-
     def write(self, plan: PushPlan) -> None:
         """Upload missing objects, then replace the manifest and remove unused objects."""
         with explained(f"push to {self.name}"):
@@ -155,21 +148,20 @@ class Objects:
             if links := [name for name, info in found.items() if info.get("islink") or info["type"] == "link"]:
                 raise RemoteError(f"{links[0]} is a link, and nothing is written through links; remove it there")
             there = {name.rpartition("/")[2]: info["size"] for name, info in found.items()}
-            files, before = plan.manifest.files, plan.before.files if plan.before else {}
-            missing = {one.sha256: path for path, one in files.items() if there.get(one.sha256) != one.size}
+            files = plan.manifest.files
+            missing = {file.sha256: path for path, file in files.items() if there.get(file.sha256) != file.size}
             sources = [str(plan.local[path]) for path in missing.values()]
             bar = TqdmCallback({"desc": "push", "unit": " files", "disable": True if self.quiet else None})
-            is_large = max([files[path].size for path in missing.values()], default=0) > _LARGE
-            at_once = {"batch_size": _LARGE_AT_ONCE if is_large else self.at_once} if self._fs.async_impl else {}
+            at_once = {"batch_size": _SENT_AT_ONCE} if self._fs.async_impl else {}
             self._fs.put(sources, [self._object(key) for key in missing], callback=bar, **at_once)
             for path in missing.values():
                 if plan.local[path].stat().st_size != files[path].size:
                     raise RemoteError(f"{plan.local[path]} was modified during the push; push again")
-            if files != before:
-                old, new = ({one.sha256 for one in some.values()} for some in (before, files))
-                listed = plan.before.replaced if plan.before else set[str]()
-                unused = (listed & there.keys()) - old - new
-                self._switch(replace(plan.manifest, replaced=frozenset(old - new | unused)), plan.before)
+            before = plan.before or Manifest(plan.manifest.kind, {})
+            if files != before.files:
+                old, new = ({file.sha256 for file in version.values()} for version in (before.files, files))
+                unused = (before.replaced & there.keys()) - old - new
+                self._switch(replace(plan.manifest, replaced=frozenset(old - new | unused)), before.version)
                 with suppress(FileNotFoundError):  # another push removes them, too
                     if unused:
                         self._fs.rm([self._object(key) for key in unused])
@@ -179,25 +171,25 @@ class Objects:
         file = manifest.files[path]
         self._fs.get_file(self._object(file.sha256), str(folder / path), callback=Arrival(file.size))
 
-    def _switch(self, new: Manifest, before: Manifest | None) -> None:
-        """Replace the manifest if it still equals `before`: on S3 atomically, elsewhere after reading it once more."""
-        found, version = self.read(), before.version if before else None
+    def _switch(self, new: Manifest, before: str) -> None:
+        """Replace the manifest if its version is still `before`: on S3 atomically, elsewhere after one more look."""
+
+        def is_outdated() -> bool:
+            return getattr(self.read(), "version", "") != before
+
         try:
-            if (found.version if found else None) != version:
+            if is_outdated():
                 raise FileExistsError
             if self._scheme in ("file", "sftp"):  # others replace a file atomically
                 partial = f"{self._root}/.{MANIFEST_FILE}.{secrets.token_hex(8)}.partial"
                 self._fs.pipe_file(partial, new.to_json())
                 self._fs.mv(partial, self._manifest)
             else:
-                condition = {"IfMatch": version} if version else {"IfNoneMatch": "*"}
+                condition = {"IfMatch": before} if before else {"IfNoneMatch": "*"}
                 self._fs.pipe_file(self._manifest, new.to_json(), **(condition if self._scheme == "s3" else {}))
         except OSError as error:
-            found = self.read()
-            if found and found.files == new.files:
-                return  # it succeeded, and only the response was lost
-            if (found.version if found else None) != version:
-                text = "was changed by another push in the meantime; nothing of this push is visible there; push again"
+            if is_outdated():  # or this push succeeded, and its answer was lost
+                text = "was changed by another push in the meantime; push again"
                 raise RemoteError(f"{self.name} {text}") from error
             raise
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import re
 import shutil
 import tempfile
@@ -14,7 +15,7 @@ from tqdm import tqdm
 
 from manip_il import checks
 from manip_il.bridges.doctor.examine import examine_folder
-from manip_il.bridges.doctor.finding import NotWhole, journals_of
+from manip_il.bridges.doctor.files import journals_of
 from manip_il.bridges.store.errors import RemoteError, explained
 from manip_il.bridges.store.hub import Hub
 from manip_il.bridges.store.manifest import (
@@ -28,14 +29,13 @@ from manip_il.bridges.store.manifest import (
     PushPlan,
     datasets_in,
     list_files,
-    newest,
 )
 from manip_il.bridges.store.objects import Objects
 from manip_il.data import atomic
 from manip_il.data.gate import check_arrived
 from manip_il.data.lerobot_layout import INFO
-from manip_il.data.ownership import DATASET, EPISODES, POLICY, kind_of, output_of, require_replaceable
-from manip_il.errors import UsageError
+from manip_il.data.ownership import DATASET, EPISODES, POLICY, kind_of, output_of
+from manip_il.errors import ManipError, UsageError
 
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://(.*[^/].*)")
 _OF_A_RUN = ("config.yaml", "config.json", "eval.json", "checkpoints", "best")
@@ -57,36 +57,47 @@ def open_remote(url: str, *, revision: str | None = None, private: bool = False,
 
 
 def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run: bool = False) -> PushPlan:
-    """Push a folder, or nothing if `dry_run`; return the differences.
+    """Push a folder; return the differences.
 
-    journals: push journals, too. Raises `NotWhole` if a check finds errors in the dataset, or in a dataset of the run,
-    `UsageError` if a dataset is pushed to a policy's address or vice versa, and `RemoteError`.
+    Args:
+        source: A dataset, run or policy.
+        remote: Where to.
+        journals: Push journals, too.
+        dry_run: Push nothing.
+
+    Raises:
+        ManipError: A check finds errors in the dataset, or in a dataset of the run.
+        UsageError: It is neither, or a dataset is pushed to a policy's address or vice versa.
+        RemoteError: The remote fails.
     """
     kind: Kind = "dataset" if (source / INFO).is_file() else "policy"
     if kind == "policy" and not any((source / name).exists() for name in _OF_A_RUN):
         text = f"neither a LeRobot dataset ({INFO}) nor a run or policy ({', '.join(_OF_A_RUN)})"
         raise UsageError(f"{source} is {text}; give one of these folders")
-    if remote.kind not in (None, kind):
+    before = None if remote.kind not in (None, kind) else remote.read()
+    there = before.kind if before else remote.kind or kind
+    if there != kind:
         text = "datasets go to hf://datasets/USER/NAME, runs to hf://USER/NAME"
-        raise UsageError(f"{source} is a {kind}, but {remote.name} is for a {remote.kind}; {text}")
+        raise UsageError(f"{source} is a {kind}, but {remote.name} is for a {there}; {text}")
     for dataset in datasets_in(source):
-        if errors := [one for one in examine_folder(dataset) if one.is_error]:
-            text = f"{dataset} is damaged and was not pushed: {' '.join(str(errors[0]).split())}"
-            raise NotWhole(f"{text}; see all errors with manip-il data check, and try manip-il data repair {dataset}")
+        if errors := [finding for finding in examine_folder(dataset) if finding.is_error]:
+            text = f"{dataset} is damaged and was not pushed: {errors[0]}"
+            raise ManipError(f"{text}; see all errors with manip-il data check {dataset}")
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
         local = list_files(source.absolute(), kind, journals=journals)
-        before = remote.read()
-        if before and before.kind != kind:
-            raise UsageError(f"{remote.name} holds a {before.kind}, not a {kind}; choose another name")
-        old, pushed = (before.files, remote.pushed(before)) if before else ({}, {})
-        if isinstance(remote, Hub):  # other remotes hold the folder unchanged
+        old = pushed = before.files if before else {}
+        if isinstance(remote, Hub):  # other remotes hold the folder unchanged, and nothing else
+            pushed = remote.pushed(before) if before else {}
             local = remote.with_card(source, local, Path(folder), keeps=CARD in old.keys() - pushed.keys())
         with ThreadPoolExecutor() as pool:
-            manifest = Manifest(kind, dict(zip(local, pool.map(File.of, local.values()), strict=True)))
-        new = manifest.files
+            new = dict(zip(local, pool.map(File.of, local.values()), strict=True))
         same = {path for path in old.keys() & new.keys() if old[path] == new[path] or old[path].fits(local[path])}
         plan = PushPlan(
-            manifest, before, local, sorted(new.keys() - same), sorted(old.keys() & pushed.keys() - new.keys())
+            manifest=Manifest(kind, new),
+            before=before,
+            local=local,
+            upload=sorted(new.keys() - same),
+            remove=sorted(old.keys() & pushed.keys() - new.keys()),
         )
         if not dry_run:
             remote.write(plan)
@@ -96,8 +107,16 @@ def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run
 def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_run: bool = False) -> Manifest:
     """Download the remote's current version to `target`, completely or not at all; return its manifest.
 
-    overwrite: replace an existing folder, atomically. Raises `FolderExistsError` if a folder exists and may not be
-    replaced, `ManipError` for a dataset that `check_arrived` refuses, and `RemoteError`.
+    Args:
+        remote: Where from.
+        target: The new folder.
+        overwrite: Replace an existing folder, atomically.
+        dry_run: Download nothing.
+
+    Raises:
+        FolderExistsError: The folder exists and may not be replaced.
+        ManipError: `check_arrived` refuses a dataset.
+        RemoteError: The remote fails, or holds nothing.
     """
     manifest = remote.read()
     if manifest is None or not manifest.files:
@@ -107,31 +126,30 @@ def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_ru
     manifest = replace(manifest, files=files)
     if dry_run:
         return manifest
-    beside, skip = journals_of(target), len(f"{JOURNALS}/")
-    journals = {
-        beside / path[skip:]: file
-        for path, file in files.items()
-        if manifest.kind == "dataset" and path.startswith(f"{JOURNALS}/")
-    }
-    there = {path for path in beside.rglob("*") if not path.is_dir()}
-    if there == journals.keys() and all(file.fits(path) for path, file in journals.items()):
-        journals = {}  # they are in place, as a killed pull leaves them
-    if journals:
-        require_replaceable(beside, EPISODES if overwrite else "")
-    kind = kind_of(target) or ""
-    kind = DATASET if manifest.kind == "dataset" else kind if kind.startswith(output_of("")) else POLICY
+    there = kind_of(target) or ""
+    kind = there if there.startswith(output_of("")) else POLICY
+    kind = DATASET if manifest.kind == "dataset" else kind
     with atomic.new_folder(target, replaces=kind if overwrite else "") as partial:
         _fetch(partial, remote, manifest)
-        for checkpoints in [path for path in partial.rglob(CHECKPOINTS) if path.is_dir()]:
-            if (name := newest(checkpoints)) and not (checkpoints / LAST).exists():
-                (checkpoints / LAST).symlink_to(name)
-        if journals:
-            with atomic.new_folder(beside, replaces=EPISODES if overwrite else "") as folder:
-                for path in list((partial / JOURNALS).iterdir()):
-                    path.rename(folder / path.name)
-        if manifest.kind == "dataset":
-            shutil.rmtree(partial / JOURNALS, ignore_errors=True)
+        for checkpoints in partial.rglob(f"{CHECKPOINTS}/"):
+            steps = [path.name for path in checkpoints.iterdir() if path.name.isdecimal()]
+            if steps and not (checkpoints / LAST).exists():
+                (checkpoints / LAST).symlink_to(max(steps, key=int))
+        journals = partial / JOURNALS
+        if manifest.kind == "dataset" and journals.is_dir():
+            _place_journals(journals, journals_of(target), EPISODES if overwrite else "")
     return manifest
+
+
+def _place_journals(arrived: Path, beside: Path, replaces: str) -> None:
+    """Move a dataset's journals beside it, unless they are there, as a killed pull leaves them."""
+    if beside.is_dir():
+        found = filecmp.dircmp(arrived, beside, ignore=[])
+        if not (found.left_only or found.right_only or found.diff_files):
+            shutil.rmtree(arrived)
+            return
+    with atomic.new_folder(beside, replaces=replaces) as folder:
+        arrived.rename(folder)
 
 
 def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest) -> None:
@@ -144,10 +162,9 @@ def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest) -> None:
         list(tqdm(arriving, "pull", len(files), unit=" files", disable=True if remote.quiet else None))
     shutil.rmtree(folder / ".cache", ignore_errors=True)  # huggingface_hub's records of the download
     with ThreadPoolExecutor() as pool:
-        fits = pool.map(lambda path: files[path].fits(folder / path), files)
-        wrong = next((path for path, is_right in zip(files, fits, strict=True) if not is_right), None)
-    if wrong is not None:
-        text = f"{checks.shorten(wrong)} has the wrong hash; nothing was kept; pull again"
-        raise RemoteError(f"{remote.name}: {text}; if that does not help, push to an empty folder, and pull from there")
+        for path, is_right in zip(files, pool.map(lambda path: files[path].fits(folder / path), files), strict=True):
+            if not is_right:
+                text = f"{checks.shorten(path)} has the wrong hash; nothing was kept; pull again"
+                raise RemoteError(f"{remote.name}: {text}, or push again, to an empty folder")
     for dataset in datasets_in(folder):
         check_arrived(dataset)
