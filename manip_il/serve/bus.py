@@ -13,7 +13,7 @@ import pty
 import select
 import threading
 import tty
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,6 @@ _CENTRE = STEPS // 2  # encoder value at joint angle zero
 _HEAD = b"\xff\xff"
 _SIZE = 96  # readable bytes of a servo's memory
 _READ_ONLY = {*range(5), *range(56, 71)}
-_LONGEST = 250  # largest length byte of a packet
 _ID, _POSITION = (_TABLE[name][0] for name in ("ID", "Present_Position"))
 _KEPT = {  # registers kept without power, by key in LeRobot's calibration file
     "id": "ID",
@@ -59,9 +58,9 @@ class Bus:
 
     calibration: the registers that the servos keep without power, by joint name. bus[NAME]: values of one
     register of all servos, (n,), by LeRobot's NAME. path: device file, for any program that uses serial ports. lock:
-    held while a packet is answered; hold it to read several registers at the same moment. connected: indices of the
-    joints whose servos are on the bus. commands: number of sync writes received. on_read: called when one packet reads
-    the positions of several servos, which a client does once per control step.
+    held while a packet is answered; hold it to read several registers at the same moment. commands: number of sync
+    writes received. on_read: called when one packet reads the positions of several servos, which a client does once per
+    control step.
     """
 
     def __init__(self, calibration: Calibration):
@@ -72,7 +71,6 @@ class Bus:
         for key, name in _KEPT.items():
             self[name] = [kept[key] for kept in calibration.values()]
         self.lock = threading.RLock()
-        self.connected: Collection[int] = range(len(calibration))
         self.commands = 0
         self.on_read: Callable[[], None] = lambda: None
         self._waiting = b""
@@ -142,47 +140,46 @@ class Bus:
 
         Invalid data, including packets with a wrong checksum, is skipped byte by byte, as a packet may begin anywhere.
         """
-        answers, self._waiting = b"", self._waiting + received
+        answers = b""
+        self._waiting += received
         while (begin := self._waiting.find(_HEAD)) >= 0:
             self._waiting = line = self._waiting[begin:]
-            if len(line) < 4:
+            end = 3 + line[3] if len(line) > 3 else len(line)
+            if len(line) <= end:
                 break
-            number = line[2]
-            length = line[3]
-            body = line[2 : 3 + line[3]]
-            sound = number != 0xFF and 2 <= length <= _LONGEST
-            if sound and len(line) < 4 + length:
-                break
-            if not sound or line[3 + length] != _checksum(body):
+            body = line[2:end]
+            if line[end] != _checksum(body):
                 self._waiting = line[1:]
                 continue
-            self._waiting = line[4 + length :]
+            self._waiting = line[end + 1 :]
             with self.lock:
-                answers += self._answer(number, body[2], body[3:])
+                answers += self._answer([*body])
         else:
             self._waiting = self._waiting[-1:]
         return answers
 
-    def _answer(self, number: int, instruction: int, parameters: bytes) -> bytes:
-        here = {int(self.memory[one, _ID]): self.memory[one] for one in self.connected}
-        if instruction == protocol.INST_PING:
-            return b"".join(_packet(one) for one in here if number in (one, protocol.BROADCAST_ID))
-        if instruction == protocol.INST_SYNC_READ and len(parameters) >= 2:
-            address, size, *asked = parameters
-            if address <= _POSITION < address + size and len(asked) > 1:
-                self.on_read()
-            return b"".join(_packet(one, _part(here[one], address, size)) for one in asked if one in here)
-        if instruction == protocol.INST_SYNC_WRITE and len(parameters) >= 2:
-            self.commands += 1
-            address, size, *rest = parameters
-            for place in range(0, len(rest) - size, size + 1):
-                if rest[place] in here:
-                    _store(here[rest[place]], address, rest[place + 1 : place + 1 + size])
-        elif instruction == protocol.INST_READ and number in here and len(parameters) == 2:
-            return _packet(number, _part(here[number], *parameters))
-        elif instruction == protocol.INST_WRITE and number in here and parameters:
-            _store(here[number], parameters[0], parameters[1:])
-            return _packet(number)
+    def _answer(self, body: list[int]) -> bytes:
+        """Return the answer to a packet, from its id on without the checksum; b"" if none is due."""
+        here = {int(servo[_ID]): servo for servo in self.memory}
+        match body:
+            case [number, _, protocol.INST_PING]:
+                return b"".join(_packet(one) for one in here if number in (one, protocol.BROADCAST_ID))
+            case [_, _, protocol.INST_SYNC_READ, address, size, *asked]:
+                if address <= _POSITION < address + size and len(asked) > 1:
+                    self.on_read()
+                return b"".join(_packet(one, _part(here[one], address, size)) for one in asked if one in here)
+            case [_, _, protocol.INST_SYNC_WRITE, address, size, *rest]:
+                self.commands += 1
+                for place in range(0, len(rest) - size, size + 1):
+                    if rest[place] in here:
+                        _store(here[rest[place]], address, rest[place + 1 : place + 1 + size])
+            case [number, _, protocol.INST_READ, address, size] if number in here:
+                return _packet(number, _part(here[number], address, size))
+            case [number, _, protocol.INST_WRITE, address, *values] if number in here:
+                _store(here[number], address, values)
+                return _packet(number)
+            case _:
+                pass
         return b""
 
 

@@ -15,7 +15,7 @@ from manip_il.data.build import Recording
 from manip_il.data.episodes import to_episode
 from manip_il.data.journal import Journal, list_seeds
 from manip_il.data.ownership import EPISODES, require_ours
-from manip_il.errors import MismatchError
+from manip_il.errors import UsageError
 from manip_il.mdp import Actor, Transition
 from manip_il.seeding import BLOCK, stream_seeds
 from manip_il.serve.station import Mover, Read, Station
@@ -34,19 +34,20 @@ class ServedEpisodes:
         self._station = station
         self._env = env_of(config)
         self._leader = leader
-        self._expert, self.driver = Expert(self._env.scene), Actor.EXPERT
-        self._reads: list[tuple[Read, Actor]] = []
-        self._running = False
+        self._expert = Expert(self._env.scene)
+        self.driver = Actor.EXPERT
+        self._reads: list[tuple[Read, Actor]] | None = None
         self._journal = Journal(folder, env_spec(config), env_fingerprint(config)) if folder is not None else None
-        if self._journal is not None:
-            require_ours(self._journal.folder, EPISODES)
+        there: list[int] = []
+        if folder is not None and self._journal is not None:
+            require_ours(folder, EPISODES)
             self._journal.prepare()
-            before = Recording.read(self._journal.folder).provenance.get("driver", SERVED)
-            if before != SERVED:
-                raise MismatchError("who drives", str(self._journal.folder), before, "this session", SERVED)
-            Recording(provenance={"driver": SERVED}).write(self._journal.folder)
-        there = set(list_seeds(folder)) if folder is not None else set[int]()
-        self._seeds = (one for one in stream_seeds("demonstrations", BLOCK, seed) if one not in there)
+            recording = Recording.read(folder)
+            if recording.provenance.get("driver", SERVED) != SERVED:
+                raise UsageError(f"--log={folder} holds journals of manip-il record; choose another folder")
+            Recording(provenance={"driver": SERVED}).write(folder)
+            there = list_seeds(folder)
+        self._seeds = (number for number in stream_seeds("demonstrations", BLOCK, seed) if number not in there)
         self.renew()
 
     def renew(self, *, keep: bool = True) -> None:
@@ -57,7 +58,7 @@ class ServedEpisodes:
 
     def begin(self, driver: Actor) -> None:
         """Begin an episode in the current world."""
-        self._reads, self._running = [], self._journal is not None
+        self._reads = []
         self.drive(driver)
 
     def drive(self, driver: Actor) -> None:
@@ -68,18 +69,17 @@ class ServedEpisodes:
 
     def frame(self, read: Read) -> None:
         """Log one read of the follower's position by the client."""
-        if not self._running:
-            return
-        if self._reads and self._reads[-1][0].commands == read.commands:  # the client asks again, as it got no answer
-            self._reads.pop()
-        self._reads.append((read, self.driver))
+        reads = self._reads
+        if reads is not None and self._journal is not None:
+            if reads and reads[-1][0].commands == read.commands:
+                reads.pop()  # the client asks again, as it got no answer
+            reads.append((read, self.driver))
 
     def end(self, *, keep: bool) -> None:
         """End the episode; if it is to be kept, write its journal at once."""
-        reads = [*self._reads, (self._station.look(), self.driver)]
-        self._reads = []
-        self._running = False
-        if self._journal is not None and keep and len(reads) > 1:
+        reads, self._reads = self._reads, None
+        if self._journal is not None and keep and reads:
+            reads.append((self._station.look(), self.driver))
             frames = [self._transition(step, reads) for step in range(len(reads) - 1)]
             self._journal.write(to_episode(frames))
 

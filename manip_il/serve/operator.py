@@ -65,10 +65,8 @@ class Operator:
             (r"Phase transition: paused -> autonomous", self._supervise),
             (r"(?s)Mismatch between calibration.*Press ENTER to use provided", partial(self._reply, ENTER)),
             (r"Press ENTER to use provided calibration file", partial(self._reply, b"c" + ENTER)),
-            (r"Connect the controller board to the '(\w+)' motor only", self._connect),
             (r"Move .* to the middle of its range of motion", self._centre),
             (r"sequentially through their entire ranges|Move all joints except", self._sweep),
-            (r"Move robot to ALL joint limits", self._explore),
         ]
         self._doing = self._watch()
         self._pid, self._terminal = _start(command)
@@ -114,9 +112,9 @@ class Operator:
         os.write(sys.stdout.fileno(), text.encode())
         self._heard += text
         while found := [(match, act) for pattern, act in self._says if (match := re.search(pattern, self._heard))]:
-            match, act = min(found, key=lambda one: one[0].start())
+            match, act = min(found, key=lambda pair: pair[0].start())
             self._heard = self._heard[match.end() :]
-            self._doing = act(*match.groups())
+            self._doing = act()
             next(self._doing, None)
         self._heard = self._heard[-_REMEMBERED:]
 
@@ -124,30 +122,29 @@ class Operator:
         """Press a key in the program's terminal; on Ctrl-C LeRobot's programs save what is complete and exit."""
         os.write(self._terminal, key)
 
-    def _wait(self, seconds: float = _SETTLED) -> Iterator[None]:
-        yield from [None] * max(1, round(seconds * self._station.env.config.control_hz))
+    def _settle(self) -> Iterator[None]:
+        yield from [None] * max(1, round(_SETTLED * self._station.env.config.control_hz))
 
     def _reply(self, key: bytes) -> Iterator[None]:
-        yield from self._wait()
+        yield from self._settle()
         self.press(key)
 
     def _attempt(self, *, supervised: bool = False) -> Iterator[None]:
-        """Wait until the task is solved or time is up; supervised: or until a policy deviates from the expert."""
+        """Wait until the task is solved or time is up, and count the episode.
+
+        supervised: also end it when a policy deviates from the expert; only a solved episode counts then.
+        """
         astray, config = 0, self._station.env.config
         for _ in range(_PATIENCE * config.horizon):
-            astray = astray + 1 if supervised and self._differs() else 0
+            wanted = self._station.expert() if supervised else None
+            told = self._station.buses["follower"].goals()
+            differs = wanted is not None and np.abs(told - wanted)[:-1].max() > self._intervene
+            astray = astray + 1 if differs else 0
             if self._station.is_solved or astray > _DIFFERS * config.control_hz:
                 break
             yield
-
-    def _differs(self) -> bool:
-        """Return whether the arm's targets differ too much from the expert's."""
-        told, wanted = self._station.buses["follower"].goals(), self._station.expert()
-        return wanted is not None and np.abs(told - wanted)[:-1].max() > self._intervene
-
-    def _count(self) -> None:
-        solved = self._station.is_solved
-        self.solved, self.failed = self.solved + solved, self.failed + (not solved)
+        self.solved += self._station.is_solved
+        self.failed += not (supervised or self._station.is_solved)
 
     def _watch(self) -> Iterator[None]:
         """For programs without episodes: once the follower moves, run attempts in a row, each in a new world."""
@@ -156,7 +153,6 @@ class Operator:
         while True:
             self._episodes.begin(self._driver)
             yield from self._attempt()
-            self._count()
             self._episodes.renew()
 
     def _hand_over(self) -> Iterator[None]:
@@ -169,7 +165,6 @@ class Operator:
         self._keep = False  # an attempt that Ctrl-C cuts off is not in the program's dataset either
         self._episodes.begin(self._driver)
         yield from self._attempt()
-        self._count()
         self._keep = self._station.is_solved or self._driver is Actor.LEARNER
         self.press(RIGHT if self._keep else LEFT)
 
@@ -183,19 +178,17 @@ class Operator:
 
     def _supervise(self) -> Iterator[None]:
         """Watch a policy in new worlds until it deviates from the expert or fails; then pause it."""
-        while True:
+        is_solved = True
+        while is_solved:
             self._episodes.renew()
             self._episodes.begin(Actor.LEARNER)
             yield from self._attempt(supervised=True)
-            if not self._station.is_solved:
-                break
-            self._count()
+            is_solved = self._station.is_solved
         self.press(PAUSE)
 
     def _correct(self) -> Iterator[None]:
         self._episodes.drive(Actor.EXPERT)
         yield from self._attempt()
-        self._count()
         self.press(CORRECT)
 
     def _resume(self) -> Iterator[None]:
@@ -204,11 +197,6 @@ class Operator:
 
     # Setting up
 
-    def _connect(self, name: str) -> Iterator[None]:
-        for bus in self._station.buses.values():
-            bus.connected = [self._station.names.index(name)]
-        yield from self._reply(ENTER)
-
     def _centre(self) -> Iterator[None]:
         self._station.hand = np.clip(0.0, *self._station.limits.T)
         yield from self._reply(ENTER)
@@ -216,20 +204,11 @@ class Operator:
     def _sweep(self) -> Iterator[None]:
         for end in self._station.limits.T:
             self._station.hand = end
-            yield from self._wait()
+            yield from self._settle()
         yield from self._reply(ENTER)
-        yield from self._wait()
+        yield from self._settle()
         self._station.hand = None
         self._station.reset(self._station.seed)
-
-    def _explore(self) -> Iterator[None]:
-        """Move the leader, and with it the follower, to both ends of each joint's range in turn."""
-        for joint, ends in enumerate(self._station.limits):
-            for end in ends:
-                q = np.clip(0.0, *self._station.limits.T)
-                q[joint] = end
-                self._station.mover = lambda q=q: q
-                yield from self._wait(3 * _SETTLED)
 
 
 def _start(command: Sequence[str]) -> tuple[int, int]:

@@ -6,6 +6,7 @@ import copy
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
@@ -66,7 +67,6 @@ class Station:
         self.env, self._config = env, config
         self._servos = replace(config.servos, **IDEAL) if config.servo == "ideal" else config.servos
         self._expert = Expert(env.scene)
-        self.names = [name.removesuffix(".pos") for name in env.scene.robot.joint_names]
         self._step = 1 / env.config.control_hz  # [s]
         self.clock = Clock(env.config.control_hz * config.speed)
         ranges = env.scene.model.jnt_range[np.isin(env.scene.model.jnt_qposadr, env.scene.arm_q)]
@@ -84,19 +84,19 @@ class Station:
         link = self._config.output_dir / name
         link.parent.mkdir(parents=True, exist_ok=True)
         kept: Calibration = {}
-        for number, (joint, limits) in enumerate(zip(self.names, self.limits, strict=True), 1):
+        for number, (label, limits) in enumerate(zip(self.env.scene.robot.joint_names, self.limits, strict=True), 1):
+            joint = label.removesuffix(".pos")
             low, high = (0, STEPS - 1) if joint == _FULL_TURN else encoder_steps(limits)
             kept[joint] = {"id": number, "homing_offset": 0, "range_min": low, "range_max": high}
         file = link.with_suffix(".json")
         bus = Bus(checks.read_json(file, "a calibration") if file.exists() else kept)
-        self._keep(name, bus)
+        self._keep(link, bus)
         link.unlink(missing_ok=True)
         link.symlink_to(bus.path)
         return bus
 
-    def _keep(self, name: str, bus: Bus) -> None:
-        content = json.dumps(bus.calibration, indent=4)
-        write_file(self._config.output_dir / f"{name}.json", content.encode())
+    def _keep(self, link: Path, bus: Bus) -> None:
+        write_file(link.with_suffix(".json"), json.dumps(bus.calibration, indent=4).encode())
 
     def look(self) -> Read:
         """Return the world and the follower as a client reads them now."""
@@ -179,6 +179,7 @@ class Station:
     def close(self) -> None:
         """Save the calibrations, close the ports, and remove their links."""
         for name, bus in self.buses.items():
-            self._keep(name, bus)
-            (self._config.output_dir / name).unlink(missing_ok=True)
+            link = self._config.output_dir / name
+            self._keep(link, bus)
+            link.unlink(missing_ok=True)
             bus.close()
