@@ -46,9 +46,9 @@ def test_an_error_exits_1_and_a_warning_0(root, capsys, monkeypatch):
         monkeypatch.chdir(root)
         assert main(["data", "check", folder]) == 1
         captured = capsys.readouterr()
-        remedy = "run manip-il data repair; what that cannot mend, pull or record again"
-        assert f"error    meta/info.json: total_tasks: 3; expected 1; {remedy}\n" in captured.out
-        assert captured.err == f"manip-il: error: {folder}: errors: 1, warnings: 1\n"
+        assert "error    meta/info.json: total_tasks: 3; expected 1\n" in captured.out
+        remedy = f"try manip-il data repair {folder}"
+        assert captured.err == f"manip-il: error: {folder}: errors: 1, warnings: 1; {remedy}\n"
 
 
 def test_repair_builds_again_and_exits_0_or_1_if_something_stays_wrong(root, capsys):
@@ -64,6 +64,7 @@ def test_repair_builds_again_and_exits_0_or_1_if_something_stays_wrong(root, cap
     root.with_name("d.before-repair").rename(root.with_name("kept"))
     (root / layout.TASKS).unlink()
     assert main(["data", "repair", str(root)]) == 1
+    assert "these cannot be repaired from what is here" in capsys.readouterr().err
     (root / layout.INFO).write_text("{")
     for journal in (root.with_name("elsewhere")).glob("*"):
         journal.unlink()

@@ -24,7 +24,7 @@ def test_a_mapping_is_its_file_and_the_example_loads(tmp_path: Path) -> None:
     number, camera = TopicSource("/a", "previous", 0.1, "x", "float32"), TopicSource("/c", "nearest", 0, video=True)
     assert load(tmp_path, **TREE) == Mapping(20, "do it", {"action": number, "observation.images.c": camera})
     example = load_mapping(ROOT / "configs/mcap/panda.yaml")
-    assert [one.topic for one in example.sources.values()][:3] == ["/joint_states", "/tf", "/action"]
+    assert [one.topic for one in example.sources.values()][:3] == ["/joint_states", "/action", "/scalars"]
 
 
 def test_a_path_leads_to_values_or_says_where_it_ends() -> None:

@@ -43,17 +43,17 @@ class Finding:
     Args:
         place: A file in the dataset or next to it, a column, or the dataset.
         text: What is wrong.
-        remedy: What to do.
+        remedy: What to do; "" for what `data repair` may mend.
         is_error: Whether it is an error.
     """
 
     place: str
     text: str
-    remedy: str = "run manip-il data repair; what that cannot mend, pull or record again"
+    remedy: str = ""
     is_error: bool = True
 
     def __str__(self) -> str:
-        line = f"{self.place}: {self.text}; {self.remedy}"
+        line = f"{self.place}: {self.text}" + (self.remedy and f"; {self.remedy}")
         return f"{'error' if self.is_error else 'warning':7}  {' '.join(line.split())}"
 
 

@@ -16,7 +16,7 @@ from manip_il.errors import ManipError
 
 def run_check(options: CheckOptions) -> None:
     """Check the dataset and print every finding and the verdict; raises `ManipError` if there are errors."""
-    _conclude(options, _examine(options))
+    _conclude(options, _examine(options), f"try manip-il data repair {options.dataset}")
 
 
 def _examine(options: CheckOptions) -> list[Finding]:
@@ -26,10 +26,10 @@ def _examine(options: CheckOptions) -> list[Finding]:
     return findings
 
 
-def _conclude(options: CheckOptions, findings: list[Finding]) -> None:
+def _conclude(options: CheckOptions, findings: list[Finding], remedy: str) -> None:
     errors = sum(finding.is_error for finding in findings)
     if errors:
-        raise ManipError(f"{options.dataset}: errors: {errors}, warnings: {len(findings) - errors}")
+        raise ManipError(f"{options.dataset}: errors: {errors}, warnings: {len(findings) - errors}; {remedy}")
     info = Dataset.open(options.dataset).info
     say(f"{options.dataset}: {info.episodes:,} episodes, {info.frames:,} frames: whole; warnings: {len(findings)}")
 
@@ -39,7 +39,7 @@ def run_repair(options: RepairOptions) -> None:
     if findings := _examine(options):
         say(*(f"repair   {line}" for line in repair(options.dataset.absolute(), findings)))
         findings = _examine(options)
-    _conclude(options, findings)
+    _conclude(options, findings, "these cannot be repaired from what is here: pull or record it again")
 
 
 def check_robot(dataset: Dataset) -> Iterator[Finding]:
