@@ -145,10 +145,11 @@ class Bus:
         while (begin := self._waiting.find(_HEAD)) >= 0:
             self._waiting = line = self._waiting[begin:]
             end = 3 + line[3] if len(line) > 3 else len(line)
-            if len(line) <= end:
-                break
             body = line[2:end]
-            if line[end] != _checksum(body):
+            is_sound = 0xFF not in line[2:4]  # neither id nor length
+            if is_sound and len(line) <= end:
+                break
+            if not is_sound or line[end] != _checksum(body):
                 self._waiting = line[1:]
                 continue
             self._waiting = line[end + 1 :]

@@ -36,7 +36,8 @@ _BATCH = 64  # decoded pictures in memory at a time
 
 def left_out(info: Info) -> list[str]:
     """Return the columns that are not exported: language, depth and other pictures that are not RGB."""
-    return [key for key in info.features if key not in INDEX_FEATURES and info.features[key] not in _columns(info)]
+    exported = {*INDEX_FEATURES, *(column.key for column in _columns(info))}
+    return [key for key in info.features if key not in exported]
 
 
 def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
@@ -46,20 +47,20 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
     `Dataset.columns` and `Dataset.camera` raise.
     """
     columns = _columns(dataset.info)
-    numbers = [one.key for one in columns if one.dtype not in PICTURES]
+    cameras = {column.key: dataset.camera(column.key) for column in columns if column.dtype in PICTURES}
+    numbers = [column.key for column in columns if column.key not in cameras]
     table = dataset.columns([*numbers, layout.TASK_INDEX])
     for key in numbers:
         require_finite(f"{dataset.root}, column {key!r}", table[key])
     texts = dataset.texts(table[layout.TASK_INDEX])
-    cameras = {one.key: dataset.camera(one.key) for one in columns if one.dtype in PICTURES}
     episodes, rate = dataset.episodes, s.exact_rate(dataset.fps)
-    for place, episode in enumerate(episodes.index.tolist()):
-        start, stop = int(episodes.start[place]), int(episodes.stop[place])
+    for episode, start, stop in zip(episodes.index.tolist(), episodes.start, episodes.stop, strict=True):
         times = foxglove.frame_times(stop - start, rate)
         channels = {_TASK_TOPIC: foxglove.texts(TASK, texts[start:stop], times)}
-        for one in columns:
-            values = _pictures(cameras[one.key], start, stop) if one.key in cameras else table[one.key][start:stop]
-            channels[_topic(one.key)] = _messages(one, values, times)
+        for column in columns:
+            key = column.key
+            values = _pictures(cameras[key], start, stop) if key in cameras else table[key][start:stop]
+            channels[_topic(key)] = _messages(column, values, times)
         path = folder / f"episode_{episode:06d}.mcap"
         with path.open("wb") as stream:
             writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
@@ -75,19 +76,22 @@ def _mapping_of(info: Info) -> dict[str, Any]:
     """Return the mapping with which an import recreates the dataset."""
     near = {"resample": "nearest", "tolerance": round(_TOLERANCE / info.fps, 6)}
     features: dict[str, Any] = {}
-    for one in _columns(info):
+    for column in _columns(info):
         about: dict[str, Any] = {"video": False}
-        if one.dtype not in PICTURES:
-            path = "message" if one.dtype == TEXT else "joints[:].position" if _is_joints(one) else "scalars[:].value"
-            about = {"field": path, "dtype": one.dtype, "names": one.names, "shape": list(one.shape)}
-        features[one.key] = {"topic": _topic(one.key), **about, **near}
+        if column.dtype not in PICTURES:
+            numbers = "joints[:].position" if _is_joints(column) else "scalars[:].value"
+            path = "message" if column.dtype == TEXT else numbers
+            about = {"field": path, "dtype": column.dtype, "names": column.names, "shape": list(column.shape)}
+        features[column.key] = {"topic": _topic(column.key), **about, **near}
     task = {"topic": _TASK_TOPIC, "field": "message", **near}
     return {"fps": info.fps, "robot_type": info.robot or None, "task": task, "features": features}
 
 
 def _columns(info: Info) -> list[Feature]:
-    columns = [feature for key, feature in info.features.items() if key not in INDEX_FEATURES]
-    return [one for one in columns if one.dtype in (*NUMBERS, TEXT) or one.is_rgb]
+    """Return the columns that are exported."""
+    kinds = (*NUMBERS, TEXT)
+    columns = [column for column in info.features.values() if column.dtype in kinds or column.is_rgb]
+    return [column for column in columns if column.key not in INDEX_FEATURES]
 
 
 def _messages(column: Feature, values: Any, times: foxglove.Times) -> foxglove.Messages:
