@@ -15,7 +15,7 @@ import numpy as np
 from manip_il.mdp import F64
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import Condition, merged
-from manip_il.sim.task import Task, objects_in
+from manip_il.sim.task import Task
 from manip_il.sim.world import World
 
 Change = Callable[[World, np.random.Generator], object]
@@ -70,7 +70,7 @@ def move_object(world: World, rng: np.random.Generator, distance: tuple[float, f
     """
     if not world.scene.task.objects:
         return
-    name = objects_in(world.scene.task, world)[0]
+    name = world.scene.task.objects_in(world)[0]
     one = world.scene.objects[name]
     before, start = world.physics(), world.data.qpos[one.q : one.q + 7].copy()
     half = min(world.extents(name)) / 2

@@ -21,7 +21,7 @@ from manip_il.robots.spec import add_wrist_camera, arm_spec, copy_options
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.rests import LEAST_HEIGHT, LEAST_ROOM, Hull
-from manip_il.sim.task import Fitting, Task
+from manip_il.sim.task import Task
 from manip_il.sim.variation import Object
 from manip_il.sim.world import SCENES_KEPT, USUAL, Scene
 
@@ -46,7 +46,7 @@ def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
     step: physics time step [s]. Raises `UsageError` if the scene does not compile, lacks an object of the task,
     or has one to grasp that is too wide for the gripper.
     """
-    task = task.fitted(robot) if isinstance(task, Fitting) else task
+    task = task.fitted(robot)
     try:
         spec = scene_spec(robot, task)
         spec.option.timestep = step

@@ -16,7 +16,7 @@ import numpy as np
 from manip_il.mdp import F64, I64
 from manip_il.sim.config import CAMERAS
 from manip_il.sim.ranges import OWN, RANGES
-from manip_il.sim.shape import Shape, contact
+from manip_il.sim.shape import ObjectShape, contact
 
 GEOMS = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
@@ -98,7 +98,7 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
     for row in rows:
         width = 2 * float(row[_SIZE].max())
         if "shape" in drawn:
-            shape = Shape.of_width(drawn["shape"], drawn.get("size", width))
+            shape = ObjectShape.of_width(drawn["shape"], drawn.get("size", width))
             row[_SIZE], row[_MASS] = [*shape.size, *[0.0] * (3 - len(shape.size))], shape.mass
         elif "size" in drawn:
             row[_SIZE] *= drawn["size"] / width

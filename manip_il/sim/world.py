@@ -75,8 +75,7 @@ class Scene:
     @cached_property
     def draws_shape(self) -> bool:
         """Whether each episode draws the shape of the object; the model as compiled has a cube."""
-        shape = getattr(self.task, "shape", None)
-        return shape is not None and shape.kind == ANY
+        return self.task.shape.kind == ANY
 
     @cached_property
     def scale(self) -> float:

@@ -12,7 +12,7 @@ from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
-from manip_il.tasks.ladder import LiftProfile, Place, Which, carry, hand_is_at, held, let_go
+from manip_il.tasks.ladder import LiftProfile, Place, Which, carry, hand_is_at, is_held, let_go
 from manip_il.tasks.objects import WOOD, add_furniture, add_part
 
 WALL, THIN = 0.05, 0.003  # height of a box, half the thickness of walls and floor [m]
@@ -59,7 +59,7 @@ def drop_rungs(
 
     return (
         Rung("let_go", at_done, lambda w: let_go(w, nearest(w), _RISE)),
-        Rung("carry", lambda w: held(w, which(w)), lambda w: carry(w, which(w), to(w), lift)),
+        Rung("carry", lambda w: is_held(w, which(w)), lambda w: carry(w, which(w), to(w), lift)),
     )
 
 

@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.sim.task import Limits, Observed, Rung, Start
+from manip_il.sim.task import Limits, Observed, Rung, Start, Task
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, OVER_WALL, add_bin, drop_place, drop_rungs, is_in, rise_over
 from manip_il.tasks.grasp import once_per_state
-from manip_il.tasks.ladder import carry_progress, grasp_progress, grasp_rungs, held
+from manip_il.tasks.ladder import carry_progress, grasp_progress, grasp_rungs, is_held
 from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
@@ -45,7 +45,7 @@ def current(world: World) -> str:
     """Return the cube that is in the hand, else the first that is not in the box; the last if all are."""
     left, ee = _left(world), world.ee.position.tolist()
     nearest = min(left, key=lambda name: math.dist(world.pose(name).position.tolist(), ee), default="")
-    if nearest and held(world, nearest):
+    if nearest and is_held(world, nearest):
         return nearest
     return left[0] if left else list(COLOURS)[-1]
 
@@ -60,7 +60,7 @@ def _to(world: World) -> F64:
 _LET_GO, _CARRY = drop_rungs(current, _to, _inside, tuple(COLOURS))
 
 
-class ClearTable:
+class ClearTable(Task):
     """Put all cubes from the table into the box."""
 
     name = "clear_table"
@@ -117,7 +117,7 @@ class ClearTable:
         if done == len(COLOURS):
             return 1.0
         name = current(world)
-        if held(world, name):
+        if is_held(world, name):
             part = 0.5 + 0.4 * carry_progress(world, name, _to(world), OVER_WALL)
         else:
             part = 0.45 * grasp_progress(world, name, OVER)

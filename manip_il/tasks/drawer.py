@@ -9,7 +9,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
 from manip_il.tasks.ladder import (
@@ -19,7 +19,7 @@ from manip_il.tasks.ladder import (
     grasp_progress,
     grasp_rungs,
     hand_is_at,
-    held,
+    is_held,
     let_go,
     nearness,
     rise_first,
@@ -224,7 +224,7 @@ def _put_aside(world: World) -> Target:
     return carry(world, OBJECT, to, OVER_TABLE)
 
 
-class Drawer:
+class Drawer(Task):
     """Open a drawer, put a cube in it, close it."""
 
     name = "drawer"
@@ -238,9 +238,9 @@ class Drawer:
         Rung("let_go", lambda w: is_in_drawer(w) and _hand_is_in(w), lambda w: let_go(w, OBJECT, HOVER)),
         Rung("push", lambda w: is_in_drawer(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
         Rung("to_push", is_in_drawer, _to_bar),
-        Rung("carry", lambda w: held(w, OBJECT) and _is_open(w), lambda w: carry(w, OBJECT, _place(w), OVER_FRONT)),
-        Rung("set_down", lambda w: held(w, OBJECT) and _is_set_down(w), lambda w: let_go(w, OBJECT, HOVER)),
-        Rung("put_aside", lambda w: held(w, OBJECT), _put_aside),
+        Rung("carry", lambda w: is_held(w, OBJECT) and _is_open(w), lambda w: carry(w, OBJECT, _place(w), OVER_FRONT)),
+        Rung("set_down", lambda w: is_held(w, OBJECT) and _is_set_down(w), lambda w: let_go(w, OBJECT, HOVER)),
+        Rung("put_aside", lambda w: is_held(w, OBJECT), _put_aside),
         Rung("make_way", lambda w: _must_shut(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
         Rung("to_make_way", _must_shut, _to_bar),
         Rung("pull", lambda w: _must_open(w) and _at_bar(w), lambda w: _move_drawer(w, OPEN)),
@@ -294,7 +294,7 @@ class Drawer:
             if _hand_is_in(world):
                 return 0.75
             return 0.8 + 0.05 * nearness(math.dist(world.ee.position, hand_at_handle(world))) + 0.15 * (1 - opened)
-        if held(world, OBJECT) and _is_open(world):
+        if is_held(world, OBJECT) and _is_open(world):
             return 0.5 + 0.25 * carry_progress(world, OBJECT, _place(world), OVER_FRONT)
         if _is_open(world):
             return 0.3 + 0.15 * grasp_progress(world, OBJECT)

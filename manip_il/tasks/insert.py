@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -11,7 +11,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_across, angle_ahead, angle_between, angle_off_vertical
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of, once_per_state
 from manip_il.tasks.ladder import CLOSED, nearness
@@ -107,25 +107,24 @@ def _bring(world: World) -> Target:
     return move(world, way, missing, sideways_at=0.015 if far else math.inf, exact=way.error < EXACT)
 
 
-def _hold(world: World) -> Target:
+def _insert_or_stay(world: World) -> Target:
     if holds_peg(world):
         return _bring(world)
     return Target(world.ee.position.copy(), world.ee.rotation.copy(), CLOSED)
 
 
 @dataclass(frozen=True)
-class Insert:
+class Insert(Task):
     """Put a peg into a hole that it fits. play: how much wider the hole is than the peg [m]."""
 
     name: str = "insert"
     instruction: str = "Put the peg into the hole."
     play: float = 0.002
-    sizes: tuple[float, float] | None = None
-    limits: Limits = field(default=Limits(tolerance=0.004, horizon=600))
-    objects: tuple[str, ...] = (PEG,)
-    grasped: tuple[str, ...] = (PEG,)
-    rungs: tuple[Rung, ...] = (
-        Rung("inserted", is_inserted, _hold),
+    limits = Limits(tolerance=0.004, horizon=600)
+    objects = (PEG,)
+    grasped = (PEG,)
+    rungs = (
+        Rung("inserted", is_inserted, _insert_or_stay),
         Rung("insert", lambda w: hangs(w) and _lift(w) < DEPTH, _bring),
         Rung("carry", hangs, _bring),
         *PEG_RUNGS,

@@ -55,10 +55,10 @@ class LiftProfile(NamedTuple):
         return min(self.most, self.slope * max(0.0, distance - self.free))
 
 
-CARRY = LiftProfile()  # to a goal with nothing around it
+OVER_NOTHING = LiftProfile()  # to a goal with nothing around it
 
 
-def held(world: World, name: str) -> bool:
+def is_held(world: World, name: str) -> bool:
     """Return whether the object is between the fingers and each of them touches it."""
     x, y, z = IN_HAND
     half = max(world.extents(name)) / 2
@@ -120,7 +120,7 @@ def close_on(world: World, name: str) -> Target:
     return Target(at, hand_down(g.yaw), CLOSED, lean=g.lean)
 
 
-def carry(world: World, name: str, to: F64, lift: LiftProfile = CARRY) -> Target:
+def carry(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) -> Target:
     """Carry the held object's centre to a point (3,) [m]: first above that point, then down."""
     x, y, z = (to - world.pose(name).position).tolist()
     off = math.hypot(x, y)
@@ -174,14 +174,14 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
     """Return the ladder that grasps an object and carries it to the goal."""
 
     def at_goal(world: World) -> bool:
-        return held(world, name) and math.dist(world.pose(name).position.tolist(), world.goal.tolist()) < AT_GOAL
+        return is_held(world, name) and math.dist(world.pose(name).position.tolist(), world.goal.tolist()) < AT_GOAL
 
     def to_goal(world: World) -> Target:
         return carry(world, name, world.goal)
 
     return (
         Rung("at_goal", at_goal, to_goal),
-        Rung("carry", lambda w: held(w, name), to_goal),
+        Rung("carry", lambda w: is_held(w, name), to_goal),
         *grasp_rungs(lambda w: name),
     )
 
@@ -196,12 +196,12 @@ def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.
 
 def pick_progress(world: World, name: str) -> float:
     """Return progress of grasping an object and carrying it to the goal, 0 to 1, by the distance left on that path."""
-    if held(world, name):
+    if is_held(world, name):
         return _GRASPED + (1 - _GRASPED) * carry_progress(world, name, world.goal)
     return 0.9 * _GRASPED * grasp_progress(world, name)
 
 
-def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = CARRY) -> float:
+def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) -> float:
     """Return progress of carrying a held object to a point (3,) [m], 0 to 1, by the distance left on `carry`'s path.
 
     That path goes up, sideways, and down.

@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.sim.shape import CUBE, Shape
-from manip_il.sim.task import CUBE_SIZES, Limits, Observed, Rung, Start
+from manip_il.sim.shape import CUBE, ObjectShape
+from manip_il.sim.task import CUBE_SIZES, Limits, Observed, Start, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.grasp import is_cube, lie_of
-from manip_il.tasks.ladder import held, pick_progress, pick_rungs
+from manip_il.tasks.ladder import is_held, pick_progress, pick_rungs
 from manip_il.tasks.objects import RED, add_cube, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import FEW_DRAWS, LIFT, LIFT_HEIGHT, UPRIGHT, draw_goal, draw_lying, draw_until
@@ -24,7 +24,7 @@ ANY_SHAPE = Limits(horizon=200)  # small or rolling objects take more attempts t
 
 
 @dataclass(frozen=True)
-class PickPlace:
+class PickPlace(Task):
     """Bring the object's centre to the goal. Ranges are those of gymnasium-robotics' FetchPickAndPlace.
 
     shape: shape of the object, a 5 cm cube unless `--task.object=` says otherwise.
@@ -33,13 +33,13 @@ class PickPlace:
     name: str = "pick_place"
     instruction: str = "Pick up the cube and bring it to the green goal."
     limits: Limits = Limits()
-    objects: tuple[str, ...] = (OBJECT,)
-    grasped: tuple[str, ...] = (OBJECT,)
+    objects = (OBJECT,)
+    grasped = (OBJECT,)
     sizes: tuple[float, float] | None = CUBE_SIZES
-    rungs: tuple[Rung, ...] = pick_rungs(OBJECT)
-    shape: Shape = CUBE
+    rungs = pick_rungs(OBJECT)
+    shape: ObjectShape = CUBE
 
-    def with_shape(self, shape: Shape) -> Self:
+    def with_shape(self, shape: ObjectShape) -> Self:
         """Return the task with another object, which its instruction also names."""
         instruction = self.instruction.replace(self.shape.word, shape.word)
         limits = self.limits if shape == CUBE else ANY_SHAPE
@@ -72,7 +72,7 @@ class PickPlace:
 
     def unsound(self, world: World) -> str:
         """Return why there is no sound label (the mesh, as it lies, is too wide or too low for the gripper), or ""."""
-        if lie_of(world, OBJECT).fits or held(world, OBJECT):
+        if lie_of(world, OBJECT).fits or is_held(world, OBJECT):
             return ""
         return f"{OBJECT} lies on a side on which it is too low or too wide for the gripper"
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from manip_il.robots.rotations import hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.ladder import CLOSED, nearness, rise_first
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_part
@@ -48,15 +48,12 @@ def _aim(world: World) -> Target:
     return Target(at, hand_down(world.ahead(at)), CLOSED)
 
 
-class Press:
+class Press(Task):
     """Press a button to its stop against its spring, and keep it there for a moment."""
 
     name = "press"
     instruction = "Press the red button."
     limits = Limits(tolerance=STOPPED)
-    objects = ()
-    grasped = ()
-    sizes = None
     rungs = (
         Rung("pressed", lambda w: TRAVEL - pressed(w) < STOPPED, _aim),
         Rung("press", lambda w: _off(w) < OVER, _aim),

@@ -10,7 +10,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.ladder import AT_GOAL, nearness, rise_first
 from manip_il.tasks.objects import RED, add_goal, add_object
@@ -134,14 +134,13 @@ def _near(world: World) -> bool:
     return math.hypot(*(_place_behind(world) - _hand(world)[:2])) < ABOVE / SLOPE
 
 
-class Push:
+class Push(Task):
     """Push a puck to a goal. The goal is flat, and the puck is moved by contact alone."""
 
     name = "push"
     instruction = "Push the puck to the green goal."
     limits = Limits(horizon=200)
     objects = (PUCK,)
-    grasped = ()
     sizes = (0.055, 0.07)
     rungs = (
         Rung("at_goal", _at_goal, _stay),

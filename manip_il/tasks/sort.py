@@ -9,11 +9,11 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, OVER_WALL, WALL, add_bin, drop_place, drop_rungs, is_in, rise_over
 from manip_il.tasks.grasp import grasp_of, lie_of, once_per_state
-from manip_il.tasks.ladder import CLEAR, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
+from manip_il.tasks.ladder import CLEAR, CLOSED, approach, grasp_progress, grasp_rungs, is_held, nearness
 from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, add_furniture
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
@@ -87,7 +87,7 @@ def _carry_progress(world: World) -> float:
 
 def _other_held(world: World) -> str:
     """Name of the wrong cube in the hand; "" if there is none."""
-    return next((name for name in COLOURS if name != asked(world) and held(world, name)), "")
+    return next((name for name in COLOURS if name != asked(world) and is_held(world, name)), "")
 
 
 def _put_back(world: World) -> Target:
@@ -152,7 +152,7 @@ def _draw_place(rng: np.random.Generator, world: World, name: str, side: float) 
 _LET_GO, _CARRY = drop_rungs(asked, _to, _is_sorted, tuple(COLOURS), OVER_WALL._replace(max_step=STEP))
 
 
-class Sort:
+class Sort(Task):
     """Put the cube that the instruction names into the bin of its colour, and leave the others on the table."""
 
     name = "sort"
@@ -234,6 +234,6 @@ class Sort:
         name = asked(world)
         if _is_sorted(world, name):
             return 1.0 if not _wrong(world) else 0.95
-        if held(world, name):
+        if is_held(world, name):
             return 0.5 + 0.4 * _carry_progress(world)
         return 0.45 * grasp_progress(world, name, OVER)

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import grasp_of, lie_of
-from manip_il.tasks.ladder import LiftProfile, carry, carry_progress, grasp_progress, grasp_rungs, held, let_go
+from manip_il.tasks.ladder import LiftProfile, carry, carry_progress, grasp_progress, grasp_rungs, is_held, let_go
 from manip_il.tasks.objects import BLUE, RED, add_cube
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
@@ -57,11 +57,15 @@ def _hand_is_away(world: World) -> bool:
     return bool(world.ee.position[2] > world.pose(TOP).position[2] + g.half + AWAY_ENOUGH)
 
 
+def _carry(world: World) -> Target:
+    return carry(world, TOP, place_on_base(world) - [0.0, 0.0, PRESS], OVER_BASE)
+
+
 def _let_go(world: World) -> Target:
     return let_go(world, TOP, grasp_of(world, TOP).half + AWAY)
 
 
-class Stack:
+class Stack(Task):
     """Put the red cube on the blue one and let go: it must stand by itself for a second."""
 
     name = "stack"
@@ -73,7 +77,7 @@ class Stack:
     rungs = (
         Rung("done", lambda w: stands(w) and _hand_is_away(w), _let_go),
         Rung("let_go", lambda w: stands(w) or _rests(w), _let_go),
-        Rung("carry", lambda w: held(w, TOP), lambda w: carry(w, TOP, place_on_base(w) - [0.0, 0.0, PRESS], OVER_BASE)),
+        Rung("carry", lambda w: is_held(w, TOP), _carry),
         *grasp_rungs(lambda w: TOP),
     )
 
@@ -113,6 +117,6 @@ class Stack:
             if _hand_is_away(world):
                 return 1.0
             return 0.9 + 0.1 * min(1.0, world.opening / world.gripper.most)
-        if held(world, TOP):
+        if is_held(world, TOP):
             return 0.5 + 0.4 * carry_progress(world, TOP, place_on_base(world), OVER_BASE)
         return 0.45 * grasp_progress(world, TOP)

@@ -19,7 +19,7 @@ from manip_il.mdp import F64
 from manip_il.option import NameOrPath
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import hand_down
-from manip_il.sim.shape import CUBE, Shape
+from manip_il.sim.shape import CUBE, ObjectShape
 from manip_il.sim.task import Limits, Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, Scene, World
 from manip_il.tasks.carry.grid import Descent, descent
@@ -38,7 +38,7 @@ from manip_il.tasks.carry.obstacles import (
     scale_of,
 )
 from manip_il.tasks.grasp import grasp_of, once_per_state
-from manip_il.tasks.ladder import AT_GOAL, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
+from manip_il.tasks.ladder import AT_GOAL, CLOSED, approach, grasp_progress, grasp_rungs, is_held, nearness
 from manip_il.tasks.pick_place import OBJECT, PickPlace
 from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying, draw_xy, turn_left
 
@@ -120,15 +120,15 @@ class Carry(PickPlace):
     instruction: str = "Carry the cube past what stands on the table to the green goal."
     limits: Limits = Limits(horizon=200)
     argument_bodies = TASTE_BODIES
-    rungs: tuple[Rung, ...] = (
-        Rung("at_goal", lambda w: held(w, OBJECT) and _at_goal(w), _to_goal),
-        Rung("carry", lambda w: held(w, OBJECT), _to_goal),
+    rungs = (
+        Rung("at_goal", lambda w: is_held(w, OBJECT) and _at_goal(w), _to_goal),
+        Rung("carry", lambda w: is_held(w, OBJECT), _to_goal),
         *grasp_rungs(lambda w: OBJECT, approach=_approach),
     )
     scale: float = 1.0
     reward: Reward = TASTES[DEFAULT]
 
-    def with_shape(self, shape: Shape) -> Self:
+    def with_shape(self, shape: ObjectShape) -> Self:
         """Return the task with another object."""
         return replace(super().with_shape(shape), limits=Limits(horizon=200 if shape == CUBE else 300))
 
@@ -174,7 +174,7 @@ class Carry(PickPlace):
         layout, at = layout_of(world, OBJECT), world.pose(OBJECT).position
         if layout.meeting:
             return "two obstacles overlap"
-        if held(world, OBJECT):
+        if is_held(world, OBJECT):
             leads = _at_goal(world) or _look(world)[1] is not None
         elif not _hand_fits(world):
             return "no room for the hand beside an obstacle"
@@ -184,7 +184,7 @@ class Carry(PickPlace):
 
     def progress(self, world: World) -> float:
         """Return progress by distance to the grasp, then by cost-to-go divided by the cost of a metre at the goal."""
-        if not held(world, OBJECT):
+        if not is_held(world, OBJECT):
             return 0.9 * _GRASPED * grasp_progress(world, OBJECT, rise=_rise(world))
         if _at_goal(world):
             return 1.0
