@@ -116,11 +116,9 @@ def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
     """Return (geom, geom, False) for each contact of the robot, and (geom, geom, True), too, if the geoms overlap."""
     model, contact = world.scene.model, world.data.contact
     robot = model.body_rootid[model.site_bodyid[world.scene.ee_site]]
-    roots = model.body_rootid[model.geom_bodyid]
-    touching = [(int(a), int(b), dist) for (a, b), dist in zip(contact.geom, contact.dist, strict=True)]
-    return {
-        (a, b, deep) for a, b, dist in touching if robot in (roots[a], roots[b]) for deep in {False, dist < _OVERLAP}
-    }
+    of_robot = (model.body_rootid[model.geom_bodyid[contact.geom]] == robot).any(axis=1)
+    touching = zip(contact.geom[of_robot].tolist(), contact.dist[of_robot], strict=True)
+    return {(a, b, deep) for (a, b), dist in touching for deep in (False, bool(dist < _OVERLAP))}
 
 
 def _open_gripper(world: World, rng: np.random.Generator) -> None:

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
+from manip_il.robots.rotations import turn_about_z
 from manip_il.seeding import rng_for
 from manip_il.sim.world import GOAL, Scene
 
@@ -99,9 +100,8 @@ def _thing(rng: np.random.Generator, scene: Scene) -> tuple[Prop, float, float]:
     x, y, z = (rng.uniform(*_HALF, 3) * scene.scale).tolist()
     size, radius, height = (((x, y, z), math.hypot(x, y), z), ((x, z, 0.0), x, z), ((x, 0.0, 0.0), x, x))[number]
     yaw, colour = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.95, 3)
-    c, s = math.cos(yaw), math.sin(yaw)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return Prop(int(_KINDS[number]), np.array(size), np.zeros(3), turn, (*colour, 1.0)), radius, height
+    prop = Prop(int(_KINDS[number]), np.array(size), np.zeros(3), turn_about_z(yaw), (*colour, 1.0))
+    return prop, radius, height
 
 
 def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> tuple[float, float] | None:

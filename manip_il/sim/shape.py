@@ -108,7 +108,7 @@ class ObjectShape:
         """MuJoCo's `geom_size` of the shape [m]."""
         width, _, length = self.lengths
         if self.kind in ("box", ANY):
-            return tuple(one / 2 for one in self.lengths)
+            return tuple(edge / 2 for edge in self.lengths)
         if self.kind == "sphere":
             return (width / 2,)
         return width / 2, (length - width if self.kind == "capsule" else length) / 2
@@ -119,14 +119,9 @@ class ObjectShape:
         if self.mesh is not None:
             return max(LIGHTEST, DENSITY * self.mesh.volume)
         width, depth, length = self.lengths
-        round_, ball = math.pi / 4 * width**2, math.pi / 6 * width**3
-        volumes = {
-            **dict.fromkeys(("box", ANY), width * depth * length),
-            "cylinder": round_ * length,
-            "sphere": ball,
-            "capsule": round_ * (length - width) + ball,
-        }
-        return max(LIGHTEST, DENSITY * volumes[self.kind])
+        disc, ball = math.pi / 4 * width**2, math.pi / 6 * width**3
+        volumes = {"cylinder": disc * length, "sphere": ball, "capsule": disc * (length - width) + ball}
+        return max(LIGHTEST, DENSITY * volumes.get(self.kind, width * depth * length))
 
     @property
     def word(self) -> str:

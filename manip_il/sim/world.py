@@ -188,10 +188,14 @@ class World:
             pose = self._poses[name] = Pose(self.data.xpos[body], self.data.xmat[body].reshape(3, 3))
         return pose
 
+    def at(self, name: str) -> F64:
+        """Return the position of a body, (3,) [m], as a view that follows the world."""
+        return self.pose(name).position
+
     @property
     def goal(self) -> F64:
         """Position of the goal marker, (3,) [m]."""
-        return self.pose(GOAL).position
+        return self.at(GOAL)
 
     @property
     def measured(self) -> F64:

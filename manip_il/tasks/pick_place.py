@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import mujoco
 import numpy as np
@@ -15,7 +15,7 @@ from manip_il.sim.task import CUBE_SIZES, Limits, Observed, Start, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.grasp import is_cube, lie_of
 from manip_il.tasks.ladder import is_held, pick_progress, pick_rungs
-from manip_il.tasks.objects import RED, add_cube, add_goal, add_object
+from manip_il.tasks.objects import CUBE_MASS, RED, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import FEW_DRAWS, LIFT, LIFT_HEIGHT, UPRIGHT, draw_goal, draw_lying, draw_until
 
@@ -47,11 +47,9 @@ class PickPlace(Task):
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the object and the goal."""
-        if self.shape == CUBE:
-            add_cube(spec, OBJECT)
-        else:
-            shape = self.shape
-            add_object(spec, OBJECT, shape.kind, shape.size, shape.mass, RED, shape.mesh)
+        shape = self.shape
+        mass = CUBE_MASS if shape == CUBE else shape.mass
+        add_object(spec, OBJECT, shape.kind, shape.size, mass, RED, shape.mesh)
         add_goal(spec)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
@@ -62,13 +60,16 @@ class PickPlace(Task):
 
     def observe(self, world: World) -> Observed:
         """Return hand, goal, the object as `observe_object` describes it, and the vectors between them."""
-        to_goal = world.goal - world.pose(OBJECT).position
-        seen = observe_object(world, OBJECT)
-        return {**observe_hand(world), "goal": world.goal, **seen, f"goal_from_{OBJECT}": to_goal}
+        return {
+            **observe_hand(world),
+            "goal": world.goal,
+            **observe_object(world, OBJECT),
+            f"goal_from_{OBJECT}": world.goal - world.at(OBJECT),
+        }
 
     def error(self, world: World) -> float:
         """Return the distance of the object's centre from the goal [m]."""
-        return math.dist(world.pose(OBJECT).position.tolist(), world.goal.tolist())
+        return math.dist(world.at(OBJECT).tolist(), world.goal.tolist())
 
     def unsound(self, world: World) -> str:
         """Return why there is no sound label (the mesh, as it lies, is too wide or too low for the gripper), or ""."""
@@ -91,20 +92,20 @@ class Lift(PickPlace):
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw the object on the table, lying or standing at any yaw, and the height of the goal over it."""
-        low, high = np.array(LIFT) * min(1.0, world.scene.robot.workspace.height / LIFT_HEIGHT)
+        low, high = np.array(LIFT) * min(1.0, world.robot.workspace.height / LIFT_HEIGHT)
 
-        def draw_both() -> tuple[Any, F64, F64]:
+        def draw_both() -> dict[str, tuple[F64, F64]]:
             at, turn = draw_lying(rng, world, OBJECT)
             goals = (at + [0.0, 0.0, rng.uniform(low, high)] for _ in range(FEW_DRAWS))
-            return next((goal for goal in goals if world.reach.has(goal)), None), at, turn
+            goal = next((goal for goal in goals if world.reach.has(goal)), None)
+            return {} if goal is None else {OBJECT: (at, turn), GOAL: (goal, UPRIGHT)}
 
-        goal, at, turn = draw_until(draw_both, lambda drawn: drawn[0] is not None, world, "the goal")
-        return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
+        return Start(draw_until(draw_both, bool, world, "the goal"))
 
 
 def observe_object(world: World, name: str) -> Observed:
     """Return an object's position, yaw modulo its symmetry, tilt and lengths, and the vector to it from the hand."""
-    position, lie = world.pose(name).position, lie_of(world, name)
+    position, lie = world.at(name), lie_of(world, name)
     if not world.scene.draws_shape and is_cube(world, name):
         seen: Observed = {
             f"{name}.cos4yaw": math.cos(4 * lie.yaw),

@@ -16,7 +16,7 @@ from manip_il.tasks.starts import UPRIGHT, draw_goal
 
 
 def _to_goal(world: World) -> Target:
-    return Target(world.goal.copy(), hand_down(world.ahead(world.goal)), CLOSED)
+    return Target(world.goal, hand_down(world.ahead(world.goal)), CLOSED)
 
 
 class ReachGoal(Task):

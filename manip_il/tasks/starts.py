@@ -69,7 +69,7 @@ def draw_resting_place(rng: np.random.Generator, world: World, name: str, height
 
     room: margin around the place [m] that must also be within reach, so that a knocked object stays within reach.
     """
-    space = world.scene.robot.workspace
+    space = world.robot.workspace
     centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
 
     def draw() -> F64:
@@ -84,7 +84,7 @@ def draw_resting_place(rng: np.random.Generator, world: World, name: str, height
 
 def draw_goal(rng: np.random.Generator, world: World, height: float, in_air: float = IN_AIR) -> F64:
     """Draw a goal at `height` over the table or, with probability `in_air`, anywhere above that; (3,) [m]."""
-    top = world.scene.robot.workspace.height if rng.uniform() < in_air else 0.0
+    top = world.robot.workspace.height if rng.uniform() < in_air else 0.0
     return draw_until(
         lambda: np.append(draw_xy(rng, world), height + rng.uniform(0, top)), world.reach.has, world, "the goal"
     )
@@ -139,7 +139,7 @@ def draw_together(
 def _no_place(world: World, what: str) -> UsageError:
     return UsageError(
         f"task {world.scene.task.name}: none of {_MOST_DRAWS} places drawn for {what} fits within reach of"
-        f" {world.scene.robot.name}; choose another task or robot"
+        f" {world.robot.name}; choose another task or robot"
     )
 
 
@@ -150,5 +150,5 @@ def resting_height(world: World, name: str) -> float:
 
 def draw_xy(rng: np.random.Generator, world: World) -> F64:
     """Draw x and y in the workspace, (2,) [m]."""
-    space = world.scene.robot.workspace
+    space = world.robot.workspace
     return np.array(space.centre) + rng.uniform(-1, 1, 2) * space.half_width
