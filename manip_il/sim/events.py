@@ -38,17 +38,6 @@ class Kind:
     needs_object: bool = False
 
 
-def noisy(action: F64, world: World, share: float, rng: np.random.Generator) -> F64:
-    """Return `action` (n,) with Gaussian noise, as in Meta-World's tests of its experts.
-
-    share: the noise's standard deviation as a share of each entry's range, which is twice the longest step for a joint,
-    and the whole range of openings for the gripper.
-    """
-    actions = world.scene.actions
-    spread = np.where(actions.relative, 2, 1) * actions.scale
-    return action + rng.normal(0.0, share, len(action)) * spread
-
-
 def random_action(action: F64, world: World, rng: np.random.Generator) -> F64:
     """Draw an action (n,): each joint within its longest step from the measured position, any gripper opening."""
     return world.scene.actions.random_near(world.measured, rng)
@@ -203,8 +192,12 @@ class Events:
             rng = rng_for(self._seed, "random actions", step)
             if rng.uniform() < share:
                 return random_action(action, self._world, rng)
-        if spread := self._drawn.get("action_noise"):
-            return noisy(action, self._world, spread, rng_for(self._seed, "action noise", step))
+        if share := self._drawn.get("action_noise"):
+            # As in Meta-World's tests of its experts, the noise is a share of each entry's range: twice the longest
+            # step for a joint, the whole range of openings for the gripper.
+            actions = self._world.scene.actions
+            noise = rng_for(self._seed, "action noise", step).normal(0.0, share, len(action))
+            return action + noise * np.where(actions.relative, 2, 1) * actions.scale
         return action
 
 

@@ -204,7 +204,6 @@ def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
     out, up = inner + CHAMFER / 2 + thick * math.sin(steep), height + CHAMFER / 2 - thick * math.cos(steep)
     add_part(hole, f"{name} edge", (CHAMFER / math.sqrt(2), inner + WALL, thick), (c * out, s * out, up), GREY)
     edge = hole.geoms[-1]
-    turn = product(turn_left(yaw), np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0]))
-    edge.quat = turn
+    edge.quat = product(turn_left(yaw), np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0]))
     edge.friction = [SLIPPERY, 0.005, 0.0001]
     edge.priority = 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -60,8 +61,8 @@ def _is_sorted(world: World, name: str) -> bool:
 
 def _wrong(world: World) -> int:
     """Number of other cubes that are in a bin."""
-    others = [name for name in COLOURS if name != asked(world)]
-    return sum(any(is_in(world, name, one, INSIDE) for one in BINS.values()) for name in others)
+    others = COLOURS.keys() - {asked(world)}
+    return sum(is_in(world, name, box, INSIDE) for name in others for box in BINS.values())
 
 
 def _place(world: World) -> F64:
@@ -75,13 +76,6 @@ def _to(world: World) -> F64:
     along = abs(place[0] - world.at(name)[0])
     inwards = math.copysign(1.0, world.robot.workspace.centre[1] - place[1])
     return place + [0.0, inwards * min(FROM_BINS, SLOPE * max(0.0, along - INSIDE[0] / 2)), 0.0]
-
-
-def _carry_progress(world: World) -> float:
-    """Progress, 0 to 1, by the distance left around the other bins and the height still to gain."""
-    along, across, up = (_place(world) - world.at(asked(world))).tolist()
-    lift = OVER_WALL.over(max(0.0, math.hypot(along, across) - INSIDE[0]))
-    return nearness(abs(along) + abs(across) + max(0.0, up + lift))
 
 
 def _other_held(world: World) -> str:
@@ -122,8 +116,8 @@ def _approach(world: World, name: str, hover: float) -> Target:
         return target
     ee, g = world.ee, grasp_of(world, name)
     hand = angle_ahead(ee.rotation)
-    yaw = min((one for one, _, _, _ in lie_of(world, name).grasps),
-              key=lambda one: (round(abs(math.sin(one - free)), 6), abs(one - hand)))  # fmt: skip
+    yaws = (yaw for yaw, _, _, _ in lie_of(world, name).grasps)
+    yaw = min(yaws, key=lambda yaw: (round(abs(math.sin(yaw - free)), 6), abs(yaw - hand)))
     low = g.at[2] + g.half + CLEAR if angle_from_down(ee.rotation, yaw) > TURNED else 0.0
     return Target(np.maximum(target.position, [-np.inf, -np.inf, low]), hand_down(yaw), g.width + NARROW)
 
@@ -198,14 +192,14 @@ class Sort(Task):
         side = rng.choice([-1.0, 1.0])
         for place, name in enumerate(rng.permutation(list(BINS.values())).tolist()):
             poses[name] = np.array([x + PITCH * (place - 1), y + side * SIDE, 0.0]), UPRIGHT
+
+        def fits(at: F64) -> bool:
+            others = [poses[name][0] for name in COLOURS if name in poses]
+            from_hand = math.dist(at[:2], hand) > FROM_HAND
+            return from_hand and world.reach.has(at) and all(math.dist(at, other) > APART for other in others)
+
         for name in COLOURS:
-            others = [poses[other][0] for other in COLOURS if other in poses]
-
-            def fits(at: F64, others: list[F64] = others) -> bool:
-                from_hand = math.dist(at[:2], hand) > FROM_HAND
-                return from_hand and world.reach.has(at) and all(math.dist(at, other) > APART for other in others)
-
-            at = draw_until(lambda name=name: _draw_place(rng, world, name, side), fits, world, name)
+            at = draw_until(partial(_draw_place, rng, world, name, side), fits, world, name)
             poses[name] = at, draw_yaw(rng)
         return Start(poses)
 
@@ -229,10 +223,12 @@ class Sort(Task):
         return (0.0 if _is_sorted(world, name) else off) + _WRONG * _wrong(world)
 
     def progress(self, world: World) -> float:
-        """Return progress of grasping the named cube and bringing it to its bin."""
+        """Return progress of grasping the named cube and bringing it to its bin around the others."""
         name = asked(world)
         if _is_sorted(world, name):
             return 1.0 if not _wrong(world) else 0.95
         if is_held(world, name):
-            return 0.5 + 0.4 * _carry_progress(world)
+            along, across, up = (_place(world) - world.at(name)).tolist()
+            lift = OVER_WALL.over(max(0.0, math.hypot(along, across) - INSIDE[0]))
+            return 0.5 + 0.4 * nearness(abs(along) + abs(across) + max(0.0, up + lift))
         return 0.45 * grasp_progress(world, name, OVER)

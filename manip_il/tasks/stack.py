@@ -53,8 +53,7 @@ def _is_on_base(world: World, height: float) -> bool:
 
 
 def _hand_is_away(world: World) -> bool:
-    g = grasp_of(world, TOP)
-    return bool(world.ee.position[2] > world.at(TOP)[2] + g.half + AWAY_ENOUGH)
+    return bool(world.ee.position[2] > world.at(TOP)[2] + grasp_of(world, TOP).half + AWAY_ENOUGH)
 
 
 def _carry(world: World) -> Target:
