@@ -2,7 +2,7 @@
 
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.shape import ObjectShape
-from manip_il.sim.task import Limits, Rung, Start, Target, Task
+from manip_il.sim.task import Rung, Start, Target, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.bins import add_bin, drop_place, drop_rungs, is_in
 from manip_il.tasks.grasp import once_per_state
@@ -32,7 +32,6 @@ __all__ = [
     "GOAL",
     "UPRIGHT",
     "LiftProfile",
-    "Limits",
     "ObjectShape",
     "PickPlace",
     "Rung",

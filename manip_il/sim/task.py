@@ -72,21 +72,6 @@ class Start:
                 raise UsageError(f"Start: {name} has {shorten(pose)}; expected (position (3,), quaternion wxyz (4,))")
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Limits of an episode, unless an environment's settings say otherwise.
-
-    Args:
-        tolerance: Greatest `Task.error` at which the task is solved [m].
-        success_steps: Steps in a row for which it must be solved, at 20 control steps a second.
-        horizon: Most control steps of an episode, at 20 a second.
-    """
-
-    tolerance: float = 0.02
-    success_steps: int = 5
-    horizon: int = 100
-
-
 class Task(ABC):
     """A task, independent of the arm; a subclass sets the first three attributes and defines the abstract methods.
 
@@ -96,7 +81,9 @@ class Task(ABC):
         name: The task's name in options.
         instruction: Text for policies that read language.
         rungs: The phases, latest first; the expert takes the first that holds, and the last always holds.
-        limits: When the task is solved and an episode ends.
+        tolerance: Greatest `error` at which the task is solved [m].
+        success_steps: Steps in a row for which it must be solved, at 20 control steps a second.
+        horizon: Most control steps of an episode, at 20 a second.
         objects: What the arm moves and must reach; events move the first.
         grasped: Objects that the gripper must go around.
         sizes: Range of an object's longest edge that the task can take [m]; None if it takes only its own object.
@@ -108,7 +95,9 @@ class Task(ABC):
     name: str
     instruction: str
     rungs: tuple[Rung, ...]
-    limits: Limits = Limits()
+    tolerance: float = 0.02
+    success_steps: int = 5
+    horizon: int = 100
     objects: tuple[str, ...] = ()
     grasped: tuple[str, ...] = ()
     sizes: tuple[float, float] | None = None

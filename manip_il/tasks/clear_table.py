@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.sim.task import Limits, Observed, Rung, Start, Task
+from manip_il.sim.task import Observed, Rung, Start, Task
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, OVER_WALL, add_bin, drop_place, drop_rungs, is_in, nearest_to_hand, rise_over
 from manip_il.tasks.grasp import once_per_state
@@ -64,7 +64,8 @@ class ClearTable(Task):
 
     name = "clear_table"
     instruction = "Put all cubes into the box."
-    limits = Limits(tolerance=0.005, horizon=900)
+    tolerance = 0.005
+    horizon = 900
     objects = tuple(COLOURS)
     grasped = tuple(COLOURS)
     sizes = (0.03, 0.04)

@@ -128,14 +128,14 @@ def _with_task(config: EnvConfig) -> EnvConfig:
         is_own = shape == task.shape
         named = config.object if isinstance(config.object, Path) else str(shape)
         task, config = task if is_own else other, replace(config, object="" if is_own else named)
-    limits, control_hz = task.limits, config.control_hz or robot.fps
+    control_hz = config.control_hz or robot.fps
     rate = control_hz / LIMITS_HZ
     return replace(
         config,
         control_hz=control_hz,
-        tolerance=config.tolerance or limits.tolerance,
-        success_steps=config.success_steps or max(1, round(limits.success_steps * rate)),
-        horizon=config.horizon or max(1, round(limits.horizon * rate)),
+        tolerance=config.tolerance or task.tolerance,
+        success_steps=config.success_steps or max(1, round(task.success_steps * rate)),
+        horizon=config.horizon or max(1, round(task.horizon * rate)),
     )
 
 

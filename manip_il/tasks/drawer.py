@@ -9,7 +9,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import is_inside, lie_of, share
 from manip_il.tasks.ladder import (
@@ -232,7 +232,8 @@ class Drawer(Task):
 
     name = "drawer"
     instruction = "Put the red cube in the drawer and close it."
-    limits = Limits(tolerance=SHUT, horizon=500)
+    tolerance = SHUT
+    horizon = 500
     objects = (OBJECT,)
     grasped = (OBJECT,)
     sizes = (0.03, 0.045)

@@ -11,7 +11,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_across, angle_ahead, angle_between, angle_off_vertical
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of, once_per_state
 from manip_il.tasks.ladder import CLOSED, nearness
@@ -118,7 +118,8 @@ class Insert(Task):
     name: str = "insert"
     instruction: str = "Put the peg into the hole."
     play: float = 0.002
-    limits = Limits(tolerance=0.004, horizon=600)
+    tolerance = 0.004
+    horizon = 600
     objects = (PEG,)
     grasped = (PEG,)
     rungs = (

@@ -11,7 +11,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.sim.shape import CUBE, ObjectShape
-from manip_il.sim.task import CUBE_SIZES, Limits, Observed, Start, Task
+from manip_il.sim.task import CUBE_SIZES, Observed, Start, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.grasp import is_cube, lie_of
 from manip_il.tasks.ladder import is_held, pick_progress, pick_rungs
@@ -20,7 +20,7 @@ from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import FEW_DRAWS, LIFT, LIFT_HEIGHT, UPRIGHT, draw_goal, draw_lying, draw_until
 
 OBJECT = "object"
-ANY_SHAPE = Limits(horizon=200)  # small or rolling objects take more attempts than a cube
+ANY_SHAPE = 200  # horizon: small or rolling objects take more attempts than a cube
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class PickPlace(Task):
 
     name: str = "pick_place"
     instruction: str = "Pick up the cube and bring it to the green goal."
-    limits: Limits = Limits()
+    horizon: int = 100
     objects = (OBJECT,)
     grasped = (OBJECT,)
     sizes: tuple[float, float] | None = CUBE_SIZES
@@ -42,8 +42,8 @@ class PickPlace(Task):
     def with_shape(self, shape: ObjectShape) -> Self:
         """Return the task with another object, which its instruction also names."""
         instruction = self.instruction.replace(self.shape.word, shape.word)
-        limits = self.limits if shape == CUBE else ANY_SHAPE
-        return replace(self, shape=shape, sizes=shape.sizes, instruction=instruction, limits=limits)
+        horizon = self.horizon if shape == CUBE else ANY_SHAPE
+        return replace(self, shape=shape, sizes=shape.sizes, instruction=instruction, horizon=horizon)
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the object and the goal."""
@@ -88,7 +88,7 @@ class Lift(PickPlace):
 
     name: str = "lift"
     instruction: str = "Lift the cube to the green goal above it."
-    limits: Limits = Limits(horizon=150)
+    horizon: int = 150
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw the object on the table, lying or standing at any yaw, and the height of the goal over it."""

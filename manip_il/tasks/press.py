@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from manip_il.robots.rotations import hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.ladder import CLOSED, LiftProfile, nearness, rise_first
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_part
@@ -51,7 +51,7 @@ class Press(Task):
 
     name = "press"
     instruction = "Press the red button."
-    limits = Limits(tolerance=STOPPED)
+    tolerance = STOPPED
     rungs = (
         Rung("pressed", lambda w: TRAVEL - pressed(w) < STOPPED, _aim),
         Rung("press", lambda w: _off(w) < OVER, _aim),

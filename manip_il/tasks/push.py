@@ -10,7 +10,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.grasp import share
 from manip_il.tasks.ladder import AT_GOAL, LiftProfile, nearness, rise_first
@@ -135,7 +135,7 @@ class Push(Task):
 
     name = "push"
     instruction = "Push the puck to the green goal."
-    limits = Limits(horizon=200)
+    horizon = 200
     objects = (PUCK,)
     sizes = (0.055, 0.07)
     rungs = (

@@ -10,7 +10,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, OVER_WALL, WALL, add_bin, drop_place, drop_rungs, is_in, rise_over
 from manip_il.tasks.grasp import grasp_of, lie_of, once_per_state, share
@@ -150,7 +150,8 @@ class Sort(Task):
 
     name = "sort"
     instruction = "Put the cube that is named into the bin of its colour."
-    limits = Limits(tolerance=0.005, horizon=250)
+    tolerance = 0.005
+    horizon = 250
     objects = tuple(COLOURS)
     grasped = tuple(COLOURS)
     sizes = (0.03, 0.04)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target, Task
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import grasp_of, lie_of
 from manip_il.tasks.ladder import LiftProfile, carry, carry_progress, grasp_progress, grasp_rungs, is_held, let_go
@@ -69,7 +69,8 @@ class Stack(Task):
 
     name = "stack"
     instruction = "Stack the red cube on the blue cube."
-    limits = Limits(success_steps=20, horizon=400)
+    success_steps = 20
+    horizon = 400
     objects = (TOP, BASE)
     grasped = (TOP,)
     sizes = (0.03, 0.07)

@@ -21,7 +21,7 @@ from manip_il.option import NameOrPath
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.shape import CUBE, ObjectShape
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, Scene, World
 from manip_il.tasks.carry.grid import Descent, descent
 from manip_il.tasks.carry.layout import ABOVE, ASIDE, DEFAULT, FULL, OBSTACLES, TASTES, Layout, Reward
@@ -108,7 +108,7 @@ class Carry(PickPlace):
 
     name: str = NAME
     instruction: str = "Carry the cube past what stands on the table to the green goal."
-    limits: Limits = Limits(horizon=200)
+    horizon: int = 200
     argument_bodies = TASTE_BODIES
     rungs = (
         Rung("at_goal", lambda w: is_held(w, OBJECT) and _at_goal(w), _to_goal),
@@ -120,7 +120,7 @@ class Carry(PickPlace):
 
     def with_shape(self, shape: ObjectShape) -> Self:
         """Return the task with another object."""
-        return replace(super().with_shape(shape), limits=Limits(horizon=200 if shape == CUBE else 300))
+        return replace(super().with_shape(shape), horizon=200 if shape == CUBE else 300)
 
     def with_argument(self, text: NameOrPath) -> Self:
         """Return the task with the reward that a text or a file describes; its name lists the nonzero weights."""
