@@ -20,7 +20,7 @@ from manip_il.robots.rotations import angle_across, yaw_ahead
 from manip_il.robots.spec import add_wrist_camera, arm_spec, copy_options
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
-from manip_il.sim.rests import LEAST_HEIGHT, Hull
+from manip_il.sim.rests import LEAST_HEIGHT, LEAST_ROOM, Hull
 from manip_il.sim.task import Task
 from manip_il.sim.variation import Object
 from manip_il.sim.world import SCENES_KEPT, USUAL, Scene
@@ -154,7 +154,9 @@ def _check_objects(scene: Scene) -> None:
         if name in scene.hulls:
             rest = scene.hulls[name].rest(0)
             width, fits = min(width for width, _ in rest.sizes), rest.fits
-            high = f"{rest.tall:.3f} m high (at least {LEAST_HEIGHT} m is needed) and "
+            high = (
+                f"rests {rest.tall:.3f} m high ({LEAST_HEIGHT} m is the least; {LEAST_ROOM} m beside it must be free), "
+            )
         elif kind in variation.KINDS:  # width between the fingers if the object lies on its worst side
             width = float(np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0])
             fits = width < most
@@ -165,7 +167,7 @@ def _check_objects(scene: Scene) -> None:
             )
         if not fits:
             raise UsageError(
-                f"task {task.name}: {name!r} is {high}{width:.3f} m wide, and the gripper of {scene.robot.name} opens "
+                f"task {task.name}: {name!r} {high}is {width:.3f} m wide, and the gripper of {scene.robot.name} opens "
                 f"to {most:.3f} m; choose another object, task or robot"
             )
 
