@@ -77,7 +77,7 @@ def compare_tasks(episodes: int, repeats: int) -> None:
 def visited(robot: str, episodes: int, task: str = "pick_place") -> list[State]:
     """Return states of `episodes` episodes driven by the expert, and of as many driven by random actions."""
     states: list[State] = []
-    horizon = {"expert": TASKS[task].limits.horizon, "random": 50}
+    horizon = {"expert": TASKS[task].horizon, "random": 50}
     for driver in ("expert", "random"):
         job = RolloutJob(make_config(robot, task, horizon=horizon[driver]), driver_of(driver), hold=5)
         for episode in job.run(stream_seeds("certificate", episodes)):

@@ -34,9 +34,9 @@ from manip_il.collect.job import RolloutJob
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes, read_journal
 from manip_il.data.schema import ENVIRONMENT_STATE
-from manip_il.mdp import Episode
+from manip_il.mdp import F64, Episode
 from manip_il.seeding import rng_for, stream_base, stream_seeds
-from manip_il.tasks.carry.layout import OBSTACLES, TASTES, Reward, path_features
+from manip_il.tasks.carry.layout import OBSTACLES, TASTES, Layout, Reward
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
 from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.envs import env_of, scene_of
@@ -153,6 +153,14 @@ def _cost(env: EnvConfig, episode: Episode, names: Sequence[str], truth: Reward)
     layout = observed_layout(scene, OBJECT, dict(zip(names, seen[0].tolist(), strict=True)))
     at = seen[:, [names.index(f"{OBJECT}.{axis}") for axis in "xyz"]]
     return float(path_features(layout, carried_stretch(at, np.array(layout.goal))) @ np.array(truth.weights))
+
+
+def path_features(layout: Layout, positions: F64) -> F64:
+    """Return the features of a path of the object's centre, (T, 3) [m], as line integrals along it, (K,)."""
+    pieces, steps = 20, np.diff(positions, axis=0)
+    points = positions[:-1, None] + (np.arange(pieces) + 0.5)[:, None] / pieces * steps[:, None]
+    densities = layout.densities(points.reshape(-1, 3)).reshape(len(steps), pieces, -1).mean(axis=1)
+    return np.linalg.norm(steps, axis=1) @ densities
 
 
 def _env(robot: str, reward: Reward) -> EnvConfig:

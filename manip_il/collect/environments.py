@@ -29,7 +29,7 @@ from manip_il.sim.env import environment_state_names
 from manip_il.sim.points import point_names
 from manip_il.sim.props import VERSION as DRAWN
 from manip_il.sim.scene import SCENES_KEPT
-from manip_il.sim.shape import MESH, Shape, stored
+from manip_il.sim.shape import MESH, ObjectShape, stored
 from manip_il.sim.task import phases
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene, env_of
@@ -127,7 +127,7 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
         if robot.name not in ROBOTS:  # a user's own robot: hash its values, not its files' paths
             said = replace(robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None))
             own |= {"robot_sha256": hashlib.sha256(repr(said).encode()).hexdigest()}
-        mesh = Shape.parse(config.object).mesh if config.object else None
+        mesh = ObjectShape.parse(config.object).mesh if config.object else None
         settings["object"], own = stored(config.object), own | ({"object_sha256": mesh.sha256} if mesh else {})
     if not config.object:  # as in fingerprints of versions that had no `object`
         del settings["object"]

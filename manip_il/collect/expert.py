@@ -10,7 +10,7 @@ from manip_il.errors import ManipError
 from manip_il.mdp import F64, Label, State
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.rotations import turned_towards
-from manip_il.sim.task import Refusing, Target, objects_in
+from manip_il.sim.task import Target
 from manip_il.sim.world import Scene, World
 
 FALLEN = -0.05  # an object below this height has left the table [m]
@@ -29,7 +29,6 @@ class Expert:
         self._scene, self._world = scene, World(scene)
         self._ik = ArmIK(scene.robot)
         self._task, rungs = scene.task, scene.task.rungs
-        self._refusing = self._task if isinstance(self._task, Refusing) else None
         self._rungs = tuple(zip(range(len(rungs), 0, -1), rungs, strict=True))
 
     def label(self, state: State, world: object | None = None) -> Label:
@@ -57,7 +56,7 @@ class Expert:
 
     def _unsound(self, world: World) -> str:
         hand = world.ee.position.tolist()
-        for name in objects_in(self._task, world):
+        for name in self._task.objects_in(world):
             position = world.pose(name).position.tolist()
             if position[2] < FALLEN:
                 return f"{name} off the table"
@@ -65,7 +64,7 @@ class Expert:
             reaches = world.reach.leaning if name in self._task.grasped else world.reach.nearly
             if not in_hand and not reaches(position):
                 return f"{name} out of reach"
-        return self._refusing.unsound(world) if self._refusing else ""
+        return self._task.unsound(world)
 
     def _towards(self, q: F64, opening: float, target: Target, phase: int) -> Label:
         ee, ee_rotation = self._ik.ee_pose(q)

@@ -21,7 +21,6 @@ from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.task import TakesArgument
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
@@ -129,11 +128,10 @@ class SceneDrawer:
         world.restore(visited.physics, visited.variation)
         free, markers = self._untouched(world), _markers(world.model)
         poses = task.draw(rng, world).poses
-        kept = task.argument_bodies if isinstance(task, TakesArgument) else ()
         new_goals, moved = rng.uniform() < GOALS, list[int]()
         for name, (at, turn) in poses.items():
             body = world.scene.model.body(name).id
-            if name in kept:
+            if name in task.argument_bodies:
                 continue
             if body in markers:
                 if new_goals:

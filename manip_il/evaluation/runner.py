@@ -26,7 +26,6 @@ from manip_il.evaluation.suites import suite_conditions
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import F64, Episode, State
 from manip_il.sim.conditions import NOMINAL, Condition, draw, turn_of
-from manip_il.sim.task import objects_in
 from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
 from manip_il.tasks.envs import config_scene
@@ -155,7 +154,7 @@ def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
         world.restore(state.physics, state.variation)
         found = {"hand": world.ee.position}
         for name in world.scene.objects:
-            found["object" if name in objects_in(task, world)[:1] else name] = world.pose(name).position
+            found["object" if name in task.objects_in(world)[:1] else name] = world.pose(name).position
     return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
 
 

@@ -33,6 +33,12 @@ def hand_down(yaw: float) -> F64:
     return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
 
 
+def turn_about_z(yaw: float) -> F64:
+    """Return the rotation (3, 3) about the world's z by `yaw` [rad]."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
 def yaw_ahead(robot: Robot, shoulder: F64, position: F64) -> float:
     """Return the world yaw [rad] that counts as zero for a hand at `position`; shoulder, position: (3,) [m]."""
     return math.atan2(position[1] - shoulder[1], position[0] - shoulder[0]) if robot.faces_ahead else 0.0

@@ -24,7 +24,7 @@ from manip_il.sim.points import points_in
 from manip_il.sim.render import Picture, pictures, projections
 from manip_il.sim.scene import build_scene
 from manip_il.sim.shape import ANY
-from manip_il.sim.task import Task, instruction_in
+from manip_il.sim.task import Task
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.window import Window, require_display
 from manip_il.sim.world import SCENES_KEPT, Scene, World
@@ -96,7 +96,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     @property
     def task_description(self) -> str:
         """Text of the episode for policies that read language."""
-        return instruction_in(self._task, self.world)
+        return self._task.instruction_in(self.world)
 
     @property
     def scene(self) -> Scene:

@@ -15,7 +15,7 @@ import numpy as np
 from manip_il.mdp import F64
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import Condition, merged
-from manip_il.sim.task import Task, objects_in
+from manip_il.sim.task import Task
 from manip_il.sim.world import World
 
 Change = Callable[[World, np.random.Generator], object]
@@ -36,17 +36,6 @@ class Kind:
     change: Change | None = None
     wrong: WrongAction | None = None
     needs_object: bool = False
-
-
-def noisy(action: F64, world: World, share: float, rng: np.random.Generator) -> F64:
-    """Return `action` (n,) with Gaussian noise, as in Meta-World's tests of its experts.
-
-    share: the noise's standard deviation as a share of each entry's range, which is twice the longest step for a joint,
-    and the whole range of openings for the gripper.
-    """
-    actions = world.scene.actions
-    spread = np.where(actions.relative, 2, 1) * actions.scale
-    return action + rng.normal(0.0, share, len(action)) * spread
 
 
 def random_action(action: F64, world: World, rng: np.random.Generator) -> F64:
@@ -70,7 +59,7 @@ def move_object(world: World, rng: np.random.Generator, distance: tuple[float, f
     """
     if not world.scene.task.objects:
         return
-    name = objects_in(world.scene.task, world)[0]
+    name = world.scene.task.objects_in(world)[0]
     one = world.scene.objects[name]
     before, start = world.physics(), world.data.qpos[one.q : one.q + 7].copy()
     half = min(world.extents(name)) / 2
@@ -116,11 +105,9 @@ def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
     """Return (geom, geom, False) for each contact of the robot, and (geom, geom, True), too, if the geoms overlap."""
     model, contact = world.scene.model, world.data.contact
     robot = model.body_rootid[model.site_bodyid[world.scene.ee_site]]
-    roots = model.body_rootid[model.geom_bodyid]
-    touching = [(int(a), int(b), dist) for (a, b), dist in zip(contact.geom, contact.dist, strict=True)]
-    return {
-        (a, b, deep) for a, b, dist in touching if robot in (roots[a], roots[b]) for deep in {False, dist < _OVERLAP}
-    }
+    of_robot = (model.body_rootid[model.geom_bodyid[contact.geom]] == robot).any(axis=1)
+    touching = zip(contact.geom[of_robot].tolist(), contact.dist[of_robot], strict=True)
+    return {(a, b, deep) for (a, b), dist in touching for deep in (False, bool(dist < _OVERLAP))}
 
 
 def _open_gripper(world: World, rng: np.random.Generator) -> None:
@@ -205,8 +192,12 @@ class Events:
             rng = rng_for(self._seed, "random actions", step)
             if rng.uniform() < share:
                 return random_action(action, self._world, rng)
-        if spread := self._drawn.get("action_noise"):
-            return noisy(action, self._world, spread, rng_for(self._seed, "action noise", step))
+        if share := self._drawn.get("action_noise"):
+            # As in Meta-World's tests of its experts, the noise is a share of each entry's range: twice the longest
+            # step for a joint, the whole range of openings for the gripper.
+            actions = self._world.scene.actions
+            noise = rng_for(self._seed, "action noise", step).normal(0.0, share, len(action))
+            return action + noise * np.where(actions.relative, 2, 1) * actions.scale
         return action
 
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
+from manip_il.robots.rotations import turn_about_z
 from manip_il.seeding import rng_for
 from manip_il.sim.world import GOAL, Scene
 
@@ -80,14 +81,14 @@ def _clutter(scene: Scene, data: mujoco.MjData, count: int, seed: int) -> list[P
     if not count:
         return []
     rng, radii = rng_for(seed, "clutter"), scene.model.geom_rbound
-    taken = [(*data.geom_xpos[geom][:2].tolist(), float(radii[geom])) for geom in scene.furniture]
+    taken = [(data.geom_xpos[geom][:2].tolist(), float(radii[geom])) for geom in scene.furniture]
     found: list[Prop] = []
     for _ in range(count):
         prop, radius, height = _thing(rng, scene)
         for _ in range(_DRAWS):
             at = _place(rng, scene, data)
-            if at is not None and all(math.dist(at, (x, y)) > radius + r for x, y, r in taken):
-                taken.append((*at, radius))
+            if at and all(math.dist(at, other) > radius + its for other, its in taken):
+                taken.append((at, radius))
                 found.append(prop._replace(position=np.array([*at, height])))
                 break
     return found
@@ -99,18 +100,16 @@ def _thing(rng: np.random.Generator, scene: Scene) -> tuple[Prop, float, float]:
     x, y, z = (rng.uniform(*_HALF, 3) * scene.scale).tolist()
     size, radius, height = (((x, y, z), math.hypot(x, y), z), ((x, z, 0.0), x, z), ((x, 0.0, 0.0), x, x))[number]
     yaw, colour = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.95, 3)
-    c, s = math.cos(yaw), math.sin(yaw)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return Prop(int(_KINDS[number]), np.array(size), np.zeros(3), turn, (*colour, 1.0)), radius, height
+    prop = Prop(int(_KINDS[number]), np.array(size), np.zeros(3), turn_about_z(yaw), (*colour, 1.0))
+    return prop, radius, height
 
 
-def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> tuple[float, float] | None:
-    """A random place on the table around the workspace; None if it is in the workspace or near the robot's base."""
+def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> list[float]:
+    """A random place on the table around the workspace; [] if it is in the workspace or near the robot's base."""
     space = scene.robot.workspace
     outer = space.half_width + _WITHIN
     x, y = rng.uniform(-outer, outer, 2).tolist()
     if max(abs(x), abs(y)) < space.half_width + _BESIDE:
-        return None
-    at = space.centre[0] + x, space.centre[1] + y
-    base = data.xanchor[scene.shoulder]
-    return at if math.dist(at, base[:2].tolist()) > _FROM_BASE else None
+        return []
+    at = [space.centre[0] + x, space.centre[1] + y]
+    return at if math.dist(at, data.xanchor[scene.shoulder][:2].tolist()) > _FROM_BASE else []

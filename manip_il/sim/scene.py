@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from manip_il.robots.spec import add_wrist_camera, arm_spec, copy_options
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.rests import LEAST_HEIGHT, LEAST_ROOM, Hull
-from manip_il.sim.task import Fitting, Task
+from manip_il.sim.task import Task
 from manip_il.sim.variation import Object
 from manip_il.sim.world import SCENES_KEPT, USUAL, Scene
 
@@ -46,7 +46,7 @@ def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
     step: physics time step [s]. Raises `UsageError` if the scene does not compile, lacks an object of the task,
     or has one to grasp that is too wide for the gripper.
     """
-    task = task.fitted(robot) if isinstance(task, Fitting) else task
+    task = task.fitted(robot)
     try:
         spec = scene_spec(robot, task)
         spec.option.timestep = step
@@ -56,7 +56,9 @@ def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
         raise UsageError(
             f"the scene of robot {robot.name} ({robot.files.model}) and task {task.name} does not compile: {why}"
         ) from None
-    return _index(robot, task, model)
+    scene = _index(robot, task, model)
+    _check_objects(scene)
+    return scene
 
 
 def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
@@ -96,7 +98,6 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
         for name, one in objects.items()
         if model.geom_type[one.geom] == int(mujoco.mjtGeom.mjGEOM_MESH)
     }
-    _check_objects(robot, task, model, objects, gripper, hulls)
     return Scene(
         robot=robot,
         task=task,
@@ -141,40 +142,33 @@ def _objects(model: mujoco.MjModel) -> dict[str, Object]:
     return objects
 
 
-def _check_objects(
-    robot: Robot,
-    task: Task,
-    model: mujoco.MjModel,
-    objects: dict[str, Object],
-    gripper: Gripper,
-    hulls: Mapping[str, Hull],
-) -> None:
+def _check_objects(scene: Scene) -> None:
     """Raise `UsageError` for an object that the scene does not have, or that is too wide or too low to grip."""
+    task, model, most = scene.task, scene.model, scene.gripper.most
     for name in (*task.objects, *task.grasped):
-        if name not in objects:
-            raise UnknownName(f"object of task {task.name}", name, objects)
+        if name not in scene.objects:
+            raise UnknownName(f"object of task {task.name}", name, scene.objects)
     for name in task.grasped:
-        rests = ""
-        if name in hulls:
-            rest = hulls[name].rest(0)
+        geom, high = scene.objects[name].geom, ""
+        kind, lengths = int(model.geom_type[geom]), 2 * model.geom_aabb[geom, 3:]
+        if name in scene.hulls:
+            rest = scene.hulls[name].rest(0)
             width, fits = min(width for width, _ in rest.sizes), rest.fits
-            rests = (
-                f"rests {rest.tall:.3f} m high ({LEAST_HEIGHT} m is the least; {LEAST_ROOM} m beside it must stay "
-                "free), "
+            high = (
+                f"rests {rest.tall:.3f} m high ({LEAST_HEIGHT} m is the least; {LEAST_ROOM} m beside it must be free), "
             )
-        else:  # width between the fingers if the object lies on its worst side
-            kind, lengths = int(model.geom_type[objects[name].geom]), 2 * model.geom_aabb[objects[name].geom, 3:]
-            if kind not in variation.KINDS:
-                raise UsageError(
-                    f"task {task.name}: the first geom of {name!r} is of MuJoCo's type {kind}; expected "
-                    f"{', '.join(variation.GEOMS)} or mesh"
-                )
+        elif kind in variation.KINDS:  # width between the fingers if the object lies on its worst side
             width = float(np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0])
-            fits = width < gripper.most
+            fits = width < most
+        else:
+            raise UsageError(
+                f"task {task.name}: the first geom of {name!r} is of MuJoCo's type {kind}; expected "
+                f"{', '.join(variation.GEOMS)} or mesh"
+            )
         if not fits:
             raise UsageError(
-                f"task {task.name}: {name!r} {rests}is {width:.3f} m wide, and the gripper of {robot.name} opens to "
-                f"{gripper.most:.3f} m; choose another object, task or robot"
+                f"task {task.name}: {name!r} {high}is {width:.3f} m wide, and the gripper of {scene.robot.name} opens "
+                f"to {most:.3f} m; choose another object, task or robot"
             )
 
 
@@ -199,7 +193,7 @@ def _fit_table(spec: mujoco.MjSpec, robot: Robot) -> None:
     middle = [_table_x(robot), y, -half[2]]
     top = spec.geom(TABLE)
     top.size, top.pos = half, middle
-    for i, (sx, sy) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
+    for i, (sx, sy) in enumerate(product((1, -1), repeat=2)):
         leg = spec.geom(f"leg{i}")
         leg.size = [0.025, 0.025, round((table.height - _THICK) / 2, 9)]
         leg.pos = [middle[0] + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -(table.height + _THICK) / 2]

@@ -37,7 +37,7 @@ SHAPE_HELP = (
 
 
 @dataclass(frozen=True)
-class Shape:
+class ObjectShape:
     """A wooden solid. kind: one of `KINDS`, `mesh` or `any`; lengths: along its own axes x, y and z [m].
 
     `any`: each episode draws one of `KINDS`, of the same width; a cube if nothing is drawn.
@@ -67,7 +67,7 @@ class Shape:
             )
 
     @classmethod
-    def parse(cls, text: NameOrPath) -> Shape:
+    def parse(cls, text: NameOrPath) -> ObjectShape:
         """Return the shape that a text describes, or a mesh, which only a `Path` can name (see `option.typed`).
 
         Raises `UnknownName` or `UsageError`.
@@ -90,7 +90,7 @@ class Shape:
             raise UsageError(f"object is {shorten(text)}; expected {kind}:{_SIZES[kind]} [m]") from None
 
     @classmethod
-    def of_width(cls, kind: str, width: float) -> Shape:
+    def of_width(cls, kind: str, width: float) -> ObjectShape:
         """Return a cube, a sphere, a cylinder as long as wide, or a capsule 1.5 times as long; raises `UsageError`."""
         return cls(kind, _lengths(kind, width))
 
@@ -108,7 +108,7 @@ class Shape:
         """MuJoCo's `geom_size` of the shape [m]."""
         width, _, length = self.lengths
         if self.kind in ("box", ANY):
-            return tuple(one / 2 for one in self.lengths)
+            return tuple(edge / 2 for edge in self.lengths)
         if self.kind == "sphere":
             return (width / 2,)
         return width / 2, (length - width if self.kind == "capsule" else length) / 2
@@ -119,14 +119,9 @@ class Shape:
         if self.mesh is not None:
             return max(LIGHTEST, DENSITY * self.mesh.volume)
         width, depth, length = self.lengths
-        round_, ball = math.pi / 4 * width**2, math.pi / 6 * width**3
-        volumes = {
-            **dict.fromkeys(("box", ANY), width * depth * length),
-            "cylinder": round_ * length,
-            "sphere": ball,
-            "capsule": round_ * (length - width) + ball,
-        }
-        return max(LIGHTEST, DENSITY * volumes[self.kind])
+        disc, ball = math.pi / 4 * width**2, math.pi / 6 * width**3
+        volumes = {"cylinder": disc * length, "sphere": ball, "capsule": disc * (length - width) + ball}
+        return max(LIGHTEST, DENSITY * volumes.get(self.kind, width * depth * length))
 
     @property
     def word(self) -> str:
@@ -159,13 +154,13 @@ def _lengths(kind: str, first: float, second: float | None = None, *rest: float)
 
 
 def draws_shape(text: NameOrPath) -> bool:
-    """Return whether `text`, as in `Shape.parse`, asks for a shape that is drawn anew in each episode."""
+    """Return whether `text`, as in `ObjectShape.parse`, asks for a shape that is drawn anew in each episode."""
     return str(text).partition(":")[0] == ANY
 
 
 def stored(text: NameOrPath) -> str:
     """Return an object's text as datasets store it: for a mesh, with the file's name and hash in place of its path."""
-    return str(Shape.parse(text)) if isinstance(text, Path) else text
+    return str(ObjectShape.parse(text)) if isinstance(text, Path) else text
 
 
 ROLLING = 0.005  # rolling friction of round objects, as on a cloth: dropped ones stay within reach [m]
@@ -180,4 +175,4 @@ def contact(kind: str) -> tuple[int, float]:
 
 
 _THINNEST, _WIDEST = 0.02, 0.07  # bounds on a scaled object: least length, greatest width between fingers [m]
-CUBE = Shape("box", (DEFAULT_WIDTH, DEFAULT_WIDTH, DEFAULT_WIDTH))
+CUBE = ObjectShape("box", (DEFAULT_WIDTH, DEFAULT_WIDTH, DEFAULT_WIDTH))

@@ -1,10 +1,11 @@
-"""The interface of a task: its objects, starts and observations, and how the expert solves it."""
+"""A task: its objects, starts and observations, and how the expert solves it."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Self
 
 import mujoco
 import numpy as np
@@ -13,18 +14,23 @@ from manip_il.errors import UsageError, shorten
 from manip_il.mdp import F64
 from manip_il.option import NameOrPath
 from manip_il.robots.robot import Robot
-from manip_il.sim.shape import Shape
+from manip_il.sim.shape import CUBE, ObjectShape
 from manip_il.sim.world import World
 
 Observed = Mapping[str, "F64 | float"]
 
 
 class Target(NamedTuple):
-    """Goal of the expert's next step: a pose of `ee`, position (3,) [m] and rotation (3, 3), and an opening [m].
+    """Goal of the expert's next step.
 
-    max_step, max_turn: how far a single step may aim towards the pose, in position [m] and rotation [rad]. exact: for
-    tight fits, keep the posture cost of inverse kinematics from pulling the hand a millimetre off its target.
-    lean: how far the hand may lean from `rotation` to reach `position`, 0 to 1.
+    Args:
+        position: Of `ee`, (3,) [m].
+        rotation: Of `ee`, (3, 3).
+        opening: Of the fingers [m].
+        max_step: How far a single step may aim towards the position [m].
+        max_turn: How far a single step may aim towards the rotation [rad].
+        exact: For tight fits: keep the posture cost of inverse kinematics from pulling the hand a millimetre off.
+        lean: How far the hand may lean from `rotation` to reach `position`, 0 to 1.
     """
 
     position: F64
@@ -38,7 +44,13 @@ class Target(NamedTuple):
 
 @dataclass(frozen=True)
 class Rung:
-    """A rung: one phase of a task. holds: whether the world is in this phase; target: where the hand moves then."""
+    """One phase of a task.
+
+    Args:
+        name: The phase's name.
+        holds: Whether the world is in this phase.
+        target: Where the hand moves then.
+    """
 
     name: str
     holds: Callable[[World], bool]
@@ -60,141 +72,81 @@ class Start:
                 raise UsageError(f"Start: {name} has {shorten(pose)}; expected (position (3,), quaternion wxyz (4,))")
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Limits of an episode. tolerance [m], success_steps, horizon [control steps]: as in `Episodes`."""
+class Task(ABC):
+    """A task, independent of the arm; a subclass sets the first three attributes and defines the abstract methods.
 
+    Each rung depends only on the world, so that the expert can label any state.
+
+    Attributes:
+        name: The task's name in options.
+        instruction: Text for policies that read language.
+        rungs: The phases, latest first; the expert takes the first that holds, and the last always holds.
+        tolerance: Greatest `error` at which the task is solved [m].
+        success_steps: Steps in a row for which it must be solved, at 20 control steps a second.
+        horizon: Most control steps of an episode, at 20 a second.
+        objects: What the arm moves and must reach; events move the first.
+        grasped: Objects that the gripper must go around.
+        sizes: Range of an object's longest edge that the task can take [m]; None if it takes only its own object.
+        shape: The object's, in a task that takes any.
+        argument_bodies: Mocap bodies whose places hold the argument of `with_argument`; they stay when other places in
+            a scene are drawn anew.
+    """
+
+    name: str
+    instruction: str
+    rungs: tuple[Rung, ...]
     tolerance: float = 0.02
     success_steps: int = 5
     horizon: int = 100
+    objects: tuple[str, ...] = ()
+    grasped: tuple[str, ...] = ()
+    sizes: tuple[float, float] | None = None
+    shape: ObjectShape = CUBE
+    argument_bodies: tuple[str, ...] = ()
 
-
-class Task(Protocol):
-    """A task, independent of the arm.
-
-    objects: what the arm moves and must reach; events move the first. grasped: those that the gripper must go around.
-    rungs: the phases, latest first; the expert takes the first that holds, and the last always holds. Each depends only
-    on the world, so that the expert can label any state.
-    """
-
-    @property
-    def name(self) -> str:
-        """The task's name in options."""
-        ...
-
-    @property
-    def instruction(self) -> str:
-        """Text for language-conditioned policies; a task whose text differs between episodes is also `Instructing`."""
-        ...
-
-    @property
-    def limits(self) -> Limits:
-        """Limits for solving and ending an episode, unless an environment's settings say otherwise."""
-        ...
-
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Objects that the arm moves."""
-        ...
-
-    @property
-    def grasped(self) -> tuple[str, ...]:
-        """Objects that the hand grasps."""
-        ...
-
-    @property
-    def sizes(self) -> tuple[float, float] | None:
-        """Range of an object's longest edge that the task can take [m]; None if it takes only its own object."""
-        ...
-
-    @property
-    def rungs(self) -> tuple[Rung, ...]:
-        """The task's phases as rungs, latest first."""
-        ...
-
+    @abstractmethod
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the task's objects (free bodies), and furniture and goal markers (mocap bodies)."""
-        ...
 
+    @abstractmethod
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw a start within the arm's reach. Raises `UsageError` if there is none."""
-        ...
 
+    @abstractmethod
     def observe(self, world: World) -> Observed:
         """Return the entries of `environment_state` by name, in its order: numbers, and vectors of x, y and z."""
-        ...
 
+    @abstractmethod
     def error(self, world: World) -> float:
         """Return how far the task is from being solved [m]; within the tolerance it is solved."""
-        ...
 
+    @abstractmethod
     def progress(self, world: World) -> float:
         """Return how much of the task is done, 0 to 1; this never falls while the task is done correctly."""
-        ...
-
-
-@runtime_checkable
-class Instructing(Protocol):
-    """A task whose text differs between episodes; a mocap body's pose in the state encodes the text."""
 
     def objects_in(self, world: World) -> tuple[str, ...]:
-        """Return the objects that the arm must reach: those that the text of the world's episode names."""
-        ...
+        """Return the objects that the arm must reach in the world's present episode."""
+        return self.objects
 
     def instruction_in(self, world: World) -> str:
-        """Return the text of the world's present episode."""
-        ...
-
-
-def instruction_in(task: Task, world: World) -> str:
-    """Return the text of the world's present episode: the task's instruction, unless texts differ between episodes."""
-    return task.instruction_in(world) if isinstance(task, Instructing) else task.instruction
-
-
-def objects_in(task: Task, world: World) -> tuple[str, ...]:
-    """Return the objects that the arm must reach in the world's present episode."""
-    return task.objects_in(world) if isinstance(task, Instructing) else task.objects
-
-
-@runtime_checkable
-class TakesShape(Protocol):
-    """A task whose object may be of any shape."""
-
-    def with_shape(self, shape: Shape) -> Task:
-        """Return this task with an object of the given shape."""
-        ...
-
-
-@runtime_checkable
-class TakesArgument(Protocol):
-    """A task with variants, called `NAME:ARGUMENT`; the state holds an episode's variant."""
-
-    def with_argument(self, text: NameOrPath) -> Task:
-        """Return the variant that a text or a file describes; its name is `NAME` or `NAME:A=NUMBER,B=NUMBER`."""
-        ...
-
-    @property
-    def argument_bodies(self) -> tuple[str, ...]:
-        """Mocap bodies whose places encode the variant; they stay when other places in a scene are drawn anew."""
-        ...
-
-
-@runtime_checkable
-class Fitting(Protocol):
-    """A task whose fixed parts are scaled to the arm."""
-
-    def fitted(self, robot: Robot) -> Task:
-        """Return this task with its fixed parts scaled to the robot."""
-        ...
-
-
-@runtime_checkable
-class Refusing(Protocol):
-    """A task in which, even with the objects within reach, the expert has no sound label for some states."""
+        """Return the text of the world's present episode; if it varies, a mocap body's pose must encode it."""
+        return self.instruction
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label; empty if there is one."""
-        ...
+        """Return why, even with the objects within reach, there is no sound label; empty if there is one."""
+        return ""
+
+    def fitted(self, robot: Robot) -> Task:
+        """Return this task with its fixed parts scaled to a robot."""
+        return self
+
+    def with_shape(self, shape: ObjectShape) -> Self:
+        """Return this task with an object of another shape. Raises `UsageError` if it takes none."""
+        raise UsageError(f"object is {shape}, but the objects of {self.name} are fixed; omit --task.object")
+
+    def with_argument(self, text: NameOrPath) -> Self:
+        """Return the variant `NAME:ARGUMENT`, whose `name` holds the argument. Raises `UsageError` if it takes none."""
+        raise UsageError(f"task is {self.name}:{text}, but {self.name} takes no argument after a colon")
 
 
 def phases(task: Task) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ import numpy as np
 from manip_il.mdp import F64, I64
 from manip_il.sim.config import CAMERAS
 from manip_il.sim.ranges import OWN, RANGES
-from manip_il.sim.shape import Shape, contact
+from manip_il.sim.shape import ObjectShape, contact
 
 GEOMS = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
@@ -98,7 +98,7 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
     for row in rows:
         width = 2 * float(row[_SIZE].max())
         if "shape" in drawn:
-            shape = Shape.of_width(drawn["shape"], drawn.get("size", width))
+            shape = ObjectShape.of_width(drawn["shape"], drawn.get("size", width))
             row[_SIZE], row[_MASS] = [*shape.size, *[0.0] * (3 - len(shape.size))], shape.mass
         elif "size" in drawn:
             row[_SIZE] *= drawn["size"] / width
@@ -136,38 +136,28 @@ def apply(
         _apply_object(model, plain, one, row, shape)
 
 
-def _apply_object(changed: Any, plain: mujoco.MjModel, one: Object, row: F64, shape: int | None) -> None:
+def _apply_object(changed: Any, plain: Any, one: Object, row: F64, shape: int | None) -> None:
     geom, body = one.geom, one.body
-    size = row[_SIZE]
-    mass = float(row[_MASS])
-    friction = float(row[_FRICTION])
-    own = int(plain.geom_type[geom])
-    kind = own
-    condim = int(plain.geom_condim[geom])
-    rolling = float(plain.geom_friction[geom, 2])
+    size, mass, friction = row[_SIZE], row[_MASS], row[_FRICTION]
+    kind = own = int(plain.geom_type[geom])
+    changed.geom_condim[geom], changed.geom_friction[geom] = plain.geom_condim[geom], plain.geom_friction[geom]
     if shape is not None:
-        kind, (condim, rolling) = shape, contact(KINDS[shape])
+        kind = shape
+        changed.geom_condim[geom], changed.geom_friction[geom, 2] = contact(KINDS[shape])
     nodes = slice(plain.body_bvhadr[body], plain.body_bvhadr[body] + plain.body_bvhnum[body])
-    like = plain
-    at = geom
+    like, at = plain, geom
     bounds = plain.bvh_aabb[nodes, 3:]
     inertia = plain.body_inertia[body] * (mass / plain.body_mass[body])
     if own != _MESH and (kind != own or not np.array_equal(size, plain.geom_size[geom])):
-        like, at = _solid(kind, size, mass), 0
+        spec = mujoco.MjSpec()  # a body of one geom, for its inertia and bounds
+        spec.worldbody.add_body().add_geom(type=mujoco.mjtGeom(kind), size=size, mass=mass)
+        like, at = spec.compile(), 0
         inertia = like.body_inertia[1]
         bounds = np.maximum(like.geom_aabb[0, 3:], bounds if plain.body_geomnum[body] > 1 else 0.0)
     for name in ("geom_type", "geom_size", "geom_rbound", "geom_aabb"):
         getattr(changed, name)[geom] = getattr(like, name)[at]
     changed.bvh_aabb[nodes, 3:] = bounds
-    changed.geom_condim[geom] = condim
     changed.body_mass[body], changed.body_inertia[body] = mass, inertia
     # MuJoCo uses the larger friction of two touching geoms unless one has priority; a drawn friction gets it.
-    changed.geom_friction[geom, 0], changed.geom_friction[geom, 2] = friction, rolling
+    changed.geom_friction[geom, 0] = friction
     changed.geom_priority[geom] = plain.geom_priority[geom] or friction != plain.geom_friction[geom, 0]
-
-
-def _solid(kind: int, size: F64, mass: float) -> mujoco.MjModel:
-    """Compile a body of one geom, for its inertia and bounds."""
-    spec = mujoco.MjSpec()
-    spec.worldbody.add_body().add_geom(type=mujoco.mjtGeom(kind), size=size, mass=mass)
-    return spec.compile()

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.mdp import F64
+from manip_il.robots.rotations import turn_about_z
 from manip_il.sim.config import CAMERAS, Look
 from manip_il.sim.scene import TABLE, camera_id
 from manip_il.sim.variation import part, seen_objects
@@ -95,8 +96,7 @@ class ViewModel:
         """Multiply every lamp by a factor, and turn those fixed in the world about the vertical [deg]."""
         for name in _LAMPS:
             attrgetter(name)(self.model)[:] *= brightness
-        turn = np.deg2rad(light_turn)
-        rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+        rotation = turn_about_z(np.deg2rad(light_turn))
         in_world = self.model.light_bodyid == 0
         for vectors in (self.model.light_pos, self.model.light_dir):
             vectors[in_world] = vectors[in_world] @ rotation.T

@@ -75,8 +75,7 @@ class Scene:
     @cached_property
     def draws_shape(self) -> bool:
         """Whether each episode draws the shape of the object; the model as compiled has a cube."""
-        shape = getattr(self.task, "shape", None)
-        return shape is not None and shape.kind == ANY
+        return self.task.shape.kind == ANY
 
     @cached_property
     def scale(self) -> float:
@@ -163,9 +162,9 @@ class World:
     def place(self, name: str, position: F64, quaternion: F64) -> None:
         """Place an object (at rest) or mocap body: position (3,) [m], quaternion wxyz (4,). Call `update` next."""
         if name in self.scene.objects:
-            one = self.scene.objects[name]
-            self.data.qpos[one.q : one.q + 7] = [*position, *quaternion]
-            self.data.qvel[one.v : one.v + 6] = 0.0
+            placed = self.scene.objects[name]
+            self.data.qpos[placed.q : placed.q + 7] = [*position, *quaternion]
+            self.data.qvel[placed.v : placed.v + 6] = 0.0
             return
         mocap = int(self._body(name).mocapid[0])
         if mocap < 0:
@@ -184,15 +183,18 @@ class World:
         """Return the pose of a body, as views that follow the world. Raises `UnknownName`."""
         pose = self._poses.get(name)
         if pose is None:
-            one = self.scene.objects.get(name)
-            body = one.body if one is not None else self._body(name).id
+            body = self._body(name).id
             pose = self._poses[name] = Pose(self.data.xpos[body], self.data.xmat[body].reshape(3, 3))
         return pose
+
+    def at(self, name: str) -> F64:
+        """Return the position of a body, (3,) [m], as a view that follows the world."""
+        return self.pose(name).position
 
     @property
     def goal(self) -> F64:
         """Position of the goal marker, (3,) [m]."""
-        return self.pose(GOAL).position
+        return self.at(GOAL)
 
     @property
     def measured(self) -> F64:
@@ -282,7 +284,7 @@ class World:
         objects, furniture = self.scene.objects, self.scene.furniture
         furniture = furniture[self.scene.model.geom_contype[furniture] > 0]
         return {
-            name: np.array([*furniture, *(one.geom for other, one in objects.items() if other != name)], dtype=np.int64)
+            name: np.append(furniture, [objects[other].geom for other in objects if other != name]).astype(np.int64)
             for name in objects
         }
 
@@ -295,5 +297,5 @@ class World:
         try:
             return self.scene.model.body(name)
         except KeyError:
-            known = (self.scene.model.body(i).name for i in range(self.scene.model.nbody))
+            known = (self.scene.model.body(number).name for number in range(self.scene.model.nbody))
             raise UnknownName("body", name, known) from None

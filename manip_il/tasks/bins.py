@@ -12,7 +12,7 @@ from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
-from manip_il.tasks.ladder import LiftProfile, Place, Which, carry, hand_is_at, held, let_go
+from manip_il.tasks.ladder import LiftProfile, Place, Which, carry, hand_is_at, is_held, let_go
 from manip_il.tasks.objects import WOOD, add_furniture, add_part
 
 WALL, THIN = 0.05, 0.003  # height of a box, half the thickness of walls and floor [m]
@@ -28,17 +28,25 @@ def add_bin(spec: mujoco.MjSpec, name: str, inside: tuple[float, float], colour:
     """Add an open box; its pose is set at the start of an episode. inside: half its inner length and width [m]."""
     box, high = add_furniture(spec, name), WALL / 2
     length, width = inside
+    x, y = length + THIN, width + THIN
+    across, along = (length + 2 * THIN, THIN, high), (THIN, width, high)
     add_part(box, f"{name} floor", (length, width, THIN), (0, 0, THIN), colour)
-    for side, sign in (("left", 1), ("right", -1)):
-        add_part(box, f"{name} {side}", (length + 2 * THIN, THIN, high), (0, sign * (width + THIN), high), colour)
-    for side, sign in (("far", 1), ("near", -1)):
-        add_part(box, f"{name} {side}", (THIN, width, high), (sign * (length + THIN), 0, high), colour)
+    add_part(box, f"{name} left", across, (0, y, high), colour)
+    add_part(box, f"{name} right", across, (0, -y, high), colour)
+    add_part(box, f"{name} far", along, (x, 0, high), colour)
+    add_part(box, f"{name} near", along, (-x, 0, high), colour)
 
 
 def is_in(world: World, name: str, box: str, inside: tuple[float, float]) -> bool:
     """Return whether an object's centre is between a box's walls."""
-    (x, y, z), (box_x, box_y, box_z) = world.pose(name).position.tolist(), world.pose(box).position.tolist()
-    return abs(x - box_x) < inside[0] and abs(y - box_y) < inside[1] and z - box_z < WALL + 0.01
+    x, y, z = (world.at(name) - world.at(box)).tolist()
+    return abs(x) < inside[0] and abs(y) < inside[1] and z < WALL + 0.01
+
+
+def nearest_to_hand(world: World, names: Sequence[str]) -> str:
+    """Return the object, of those named, whose centre is nearest to the hand."""
+    ee = world.ee.position.tolist()
+    return min(names, key=lambda name: math.dist(world.at(name).tolist(), ee))
 
 
 def drop_rungs(
@@ -50,8 +58,7 @@ def drop_rungs(
     """
 
     def nearest(world: World) -> str:
-        ee = world.ee.position.tolist()
-        return min(names, key=lambda name: math.dist(world.pose(name).position.tolist(), ee))
+        return nearest_to_hand(world, names)
 
     def at_done(world: World) -> bool:
         name = nearest(world)
@@ -59,17 +66,17 @@ def drop_rungs(
 
     return (
         Rung("let_go", at_done, lambda w: let_go(w, nearest(w), _RISE)),
-        Rung("carry", lambda w: held(w, which(w)), lambda w: carry(w, which(w), to(w), lift)),
+        Rung("carry", lambda w: is_held(w, which(w)), lambda w: carry(w, which(w), to(w), lift)),
     )
 
 
 def rise_over(world: World, box: str) -> Target:
     """Rise to a point over a box, fingers open."""
-    at = world.pose(box).position + [0.0, 0.0, AWAY]
+    at = world.at(box) + [0.0, 0.0, AWAY]
     return Target(at, hand_down(world.ahead(at)), world.gripper.most)
 
 
 def drop_place(world: World, name: str, box: str, offset: Sequence[float] = (0.0, 0.0)) -> F64:
     """Return where to release an object over a box, (3,) [m]; offset: from the middle of its floor, (2,) [m]."""
     height = 2 * THIN + lie_of(world, name).tall / 2 + DROP
-    return world.pose(box).position + [offset[0], offset[1], height]
+    return world.at(box) + [offset[0], offset[1], height]

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import product
 
 import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.sim.task import Limits, Observed, Rung, Start
+from manip_il.sim.task import Observed, Rung, Start, Task
 from manip_il.sim.world import World
-from manip_il.tasks.bins import OVER, OVER_WALL, add_bin, drop_place, drop_rungs, is_in, rise_over
+from manip_il.tasks.bins import OVER, OVER_WALL, add_bin, drop_place, drop_rungs, is_in, nearest_to_hand, rise_over
 from manip_il.tasks.grasp import once_per_state
-from manip_il.tasks.ladder import carry_progress, grasp_progress, grasp_rungs, held
+from manip_il.tasks.ladder import carry_progress, grasp_progress, grasp_rungs, is_held
 from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
@@ -24,6 +25,7 @@ BOX = "box"
 INSIDE = (0.075, 0.075)  # half the box's inner length and width [m]
 HALF = 0.018  # half a cube's edge length [m]
 SLOT = 0.032  # offset of a cube's release point from the box's middle, along each side [m]
+SLOTS = {name: (x, y) for name, (y, x) in zip(COLOURS, product((-SLOT, SLOT), repeat=2), strict=True)}
 SIDE = 0.225  # offset of the box's middle from the workspace's, left or right [m]
 APART = 0.08  # least distance between cubes at the start [m]
 ROOM = 0.03  # reachable margin around a cube at the start [m]
@@ -43,29 +45,27 @@ def _inside(world: World, name: str) -> bool:
 @once_per_state
 def current(world: World) -> str:
     """Return the cube that is in the hand, else the first that is not in the box; the last if all are."""
-    left, ee = _left(world), world.ee.position.tolist()
-    nearest = min(left, key=lambda name: math.dist(world.pose(name).position.tolist(), ee), default="")
-    if nearest and held(world, nearest):
-        return nearest
-    return left[0] if left else list(COLOURS)[-1]
+    left = _left(world) or tuple(COLOURS)[-1:]
+    nearest = nearest_to_hand(world, left)
+    return nearest if is_held(world, nearest) else left[0]
 
 
 def _to(world: World) -> F64:
     """Release point of the current cube over its own quarter of the box, (3,) [m]."""
     name = current(world)
-    slot = list(COLOURS).index(name)
-    return drop_place(world, name, BOX, (SLOT * (1 if slot % 2 else -1), SLOT * (1 if slot // 2 else -1)))
+    return drop_place(world, name, BOX, SLOTS[name])
 
 
 _LET_GO, _CARRY = drop_rungs(current, _to, _inside, tuple(COLOURS))
 
 
-class ClearTable:
+class ClearTable(Task):
     """Put all cubes from the table into the box."""
 
     name = "clear_table"
     instruction = "Put all cubes into the box."
-    limits = Limits(tolerance=0.005, horizon=900)
+    tolerance = 0.005
+    horizon = 900
     objects = tuple(COLOURS)
     grasped = tuple(COLOURS)
     sizes = (0.03, 0.04)
@@ -84,7 +84,7 @@ class ClearTable:
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw the box's side, and the cubes on the table, apart and at any yaw."""
-        x, y = world.scene.robot.workspace.centre
+        x, y = world.robot.workspace.centre
         box = np.array([x + rng.uniform(-0.03, 0.03), y + rng.choice([-1.0, 1.0]) * SIDE, 0.0])
 
         def fits(at: F64, others: Sequence[F64]) -> bool:
@@ -99,17 +99,17 @@ class ClearTable:
         name = current(world)
         return {
             **observe_hand(world),
-            BOX: world.pose(BOX).position,
+            BOX: world.at(BOX),
             **{key.replace(name, "next", 1): value for key, value in observe_object(world, name).items()},
-            "place_from_next": _to(world) - world.pose(name).position,
-            **{one: world.pose(one).position for one in COLOURS},
+            "place_from_next": _to(world) - world.at(name),
+            **{one: world.at(one) for one in COLOURS},
             **{f"{one}.in_box": float(_inside(world, one)) for one in COLOURS},
         }
 
     def error(self, world: World) -> float:
         """Return the distance from the box's middle, summed over the cubes that are not inside [m]."""
-        at = world.pose(BOX).position
-        return sum(math.dist(world.pose(name).position, at) for name in _left(world))
+        at = world.at(BOX)
+        return sum(math.dist(world.at(name), at) for name in _left(world))
 
     def progress(self, world: World) -> float:
         """Return progress by the number of cubes in the box and the state of the next one."""
@@ -117,8 +117,7 @@ class ClearTable:
         if done == len(COLOURS):
             return 1.0
         name = current(world)
-        if held(world, name):
+        part = 0.45 * grasp_progress(world, name, OVER)
+        if is_held(world, name):
             part = 0.5 + 0.4 * carry_progress(world, name, _to(world), OVER_WALL)
-        else:
-            part = 0.45 * grasp_progress(world, name, OVER)
         return (done + part) / len(COLOURS)

@@ -11,7 +11,7 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.option import NameOrPath, check_bounds, make_options, option, typed
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import MOST_HZ, Episodes
-from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
+from manip_il.sim.shape import SHAPE_HELP, ObjectShape
 from manip_il.tasks import NAMES, SEVERAL
 from manip_il.tasks.stock import table as stock
 
@@ -30,9 +30,9 @@ TASK_HELP = (
 class EnvConfig(Episodes):
     """Settings of one environment; every field is part of the fingerprint. `make_config` checks and completes them.
 
-    robot, task: a name, or the `Path` of a user's own file. object: shape and size of what is grasped, as `Shape.parse`
-    reads it, or the `Path` of a mesh; empty for the task's default. A name that was stored is a `str`, which no code
-    takes for a path.
+    robot, task: a name, or the `Path` of a user's own file. object: shape and size of what is grasped, as
+    `ObjectShape.parse` reads it, or the `Path` of a mesh; empty for the task's default. A name that was stored is a
+    `str`, which no code takes for a path.
     """
 
     robot: NameOrPath = option("panda", ROBOT_HELP, flag="robot.type")
@@ -115,28 +115,27 @@ def _with_task(config: EnvConfig) -> EnvConfig:
     """Canonicalise the object (the default becomes "") and the task's argument; fill in rate and limits."""
     from manip_il.robots.table import get_robot  # imported here: help needs no robot and no simulator
     from manip_il.sim.mesh import mesh_path
-    from manip_il.sim.task import TakesArgument
     from manip_il.tasks.table import get_task
 
     task, robot = get_task(config.task), get_robot(config.robot)
     for file in (config.task, config.robot, mesh_path(config.object)):
         if isinstance(file, Path):
             check_unchanged(file)
-    if isinstance(task, TakesArgument):
+    if task.argument_bodies:
         config = replace(config, task=task.name)
     if config.object:
-        shape, other = Shape.parse(config.object), get_task(config.task, config.object)
-        is_own = shape == getattr(task, "shape", CUBE)
+        shape, other = ObjectShape.parse(config.object), get_task(config.task, config.object)
+        is_own = shape == task.shape
         named = config.object if isinstance(config.object, Path) else str(shape)
         task, config = task if is_own else other, replace(config, object="" if is_own else named)
-    limits, control_hz = task.limits, config.control_hz or robot.fps
+    control_hz = config.control_hz or robot.fps
     rate = control_hz / LIMITS_HZ
     return replace(
         config,
         control_hz=control_hz,
-        tolerance=config.tolerance or limits.tolerance,
-        success_steps=config.success_steps or max(1, round(limits.success_steps * rate)),
-        horizon=config.horizon or max(1, round(limits.horizon * rate)),
+        tolerance=config.tolerance or task.tolerance,
+        success_steps=config.success_steps or max(1, round(task.success_steps * rate)),
+        horizon=config.horizon or max(1, round(task.horizon * rate)),
     )
 
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import lie_of
+from manip_il.tasks.grasp import is_inside, lie_of, share
 from manip_il.tasks.ladder import (
     LiftProfile,
     carry,
@@ -19,7 +19,7 @@ from manip_il.tasks.ladder import (
     grasp_progress,
     grasp_rungs,
     hand_is_at,
-    held,
+    is_held,
     let_go,
     nearness,
     rise_first,
@@ -52,8 +52,11 @@ HALF = 0.02  # half the cube's edge length [m]
 OPEN_ENOUGH, SHUT = 0.09, 0.008  # opening that lets the object in; largest that counts as shut [m]
 FINGERS = 0.045  # opening of the fingers around the handle [m]
 SLACK = FINGERS / 2 - BAR_HALF  # play of the hand along the pull before a finger meets the handle [m]
-AROUND = (0.024, 0.03, 0.018, 0.25)  # largest offset of the moving hand from the handle: x, y, z [m], angle [rad]
-HOVER, SLOPE = 0.08, 2.0  # height of the hand over the handle on its way there [m]; height per distance from it
+AROUND = (0.024, 0.03, 0.018)  # largest offset of the moving hand from the handle [m]
+AROUND_ANGLE = 0.25  # [rad]
+SPARE = 0.012  # deviation from `FINGERS` up to which the fingers fit around the handle [m]
+HOVER = 0.08  # greatest height of the hand over the handle on its way there [m]
+FUNNEL = LiftProfile(HOVER, slope=2.0, free=0.006)  # that height, by the hand's misalignment
 BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.08  # object's offset from the handle at the start: most in x, least in y [m]
 DROP = 0.018  # height of the object over the drawer's floor at release [m]
 OVER = 0.13  # height of the hand over the object on approach [m]
@@ -77,12 +80,11 @@ def add_cabinet(spec: mujoco.MjSpec) -> None:
     length, width = INSIDE
     deep, wide = length + 2 * THIN, width + 3 * THIN  # half the cabinet's depth and width
     back = front + 2 * deep
-    for side, sign in (("left", 1), ("right", -1)):
-        add_part(
-            cabinet, f"cabinet {side}", (deep, THIN, ROOF / 2), (front + deep, sign * (wide + THIN), ROOF / 2), WOOD
-        )
-    add_part(cabinet, "cabinet back", (THIN, wide + 2 * THIN, ROOF / 2), (back + THIN, 0, ROOF / 2), WOOD)
-    add_part(cabinet, "cabinet top", (deep + THIN, wide + 2 * THIN, THIN), (front + deep + THIN, 0, ROOF + THIN), WOOD)
+    whole = wide + 2 * THIN
+    for side, y in (("left", wide + THIN), ("right", -(wide + THIN))):
+        add_part(cabinet, f"cabinet {side}", (deep, THIN, ROOF / 2), (front + deep, y, ROOF / 2), WOOD)
+    add_part(cabinet, "cabinet back", (THIN, whole, ROOF / 2), (back + THIN, 0, ROOF / 2), WOOD)
+    add_part(cabinet, "cabinet top", (deep + THIN, whole, THIN), (front + deep + THIN, 0, ROOF + THIN), WOOD)
     tray = cabinet.add_body(name=TRAY)
     tray.add_joint(
         name=TRAY, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-1, 0, 0], limited=True, range=[0, OPEN],
@@ -90,35 +92,35 @@ def add_cabinet(spec: mujoco.MjSpec) -> None:
     )  # fmt: skip
     middle = front + length
     add_part(tray, "drawer floor", (length, width, THIN), (middle, 0, FLOOR - THIN), WOOD)
-    for side, sign in (("left", 1), ("right", -1)):
-        add_part(tray, f"drawer {side}", (length, THIN, WALL / 2), (middle, sign * (width + THIN), WALL / 2), WOOD)
+    for side, y in (("left", width + THIN), ("right", -(width + THIN))):
+        add_part(tray, f"drawer {side}", (length, THIN, WALL / 2), (middle, y, WALL / 2), WOOD)
     back_z, back_half = (ROOF - THIN + FLOOR) / 2, (ROOF - THIN - FLOOR) / 2  # so high that nothing gets behind it
     add_part(tray, "drawer back", (THIN, width, back_half), (front + 2 * length + THIN, 0, back_z), WOOD)
-    add_part(tray, "drawer front", (THIN, wide + 2 * THIN, PANEL / 2), (GAP + THIN, 0, PANEL / 2), WOOD)
+    add_part(tray, "drawer front", (THIN, whole, PANEL / 2), (GAP + THIN, 0, PANEL / 2), WOOD)
     add_part(tray, BAR, (BAR_HALF, BAR_LENGTH, BAR_HALF), (0, 0, BAR_Z), GREY)
-    for side, sign in (("left", 1), ("right", -1)):
-        add_part(tray, f"{BAR} {side}", (GAP / 2, BAR_HALF, BAR_HALF), (GAP / 2, sign * BAR_LENGTH, BAR_Z), GREY)
+    for side, y in (("left", BAR_LENGTH), ("right", -BAR_LENGTH)):
+        add_part(tray, f"{BAR} {side}", (GAP / 2, BAR_HALF, BAR_HALF), (GAP / 2, y, BAR_Z), GREY)
     spec.add_exclude(bodyname1=CABINET, bodyname2=TRAY)
 
 
 def pulled(world: World) -> float:
     """Return how far the drawer is open [m]."""
-    return float(world.pose(CABINET).position[0] - world.pose(TRAY).position[0])
+    return float(world.at(CABINET)[0] - world.at(TRAY)[0])
 
 
 def middle_of_drawer(world: World) -> F64:
     """Return the middle of the drawer's floor, (3,) [m]."""
-    return world.pose(TRAY).position + [MIDDLE, 0.0, FLOOR]
+    return world.at(TRAY) + [MIDDLE, 0.0, FLOOR]
 
 
 def hand_at_handle(world: World) -> F64:
     """Return the hand's position with the handle between its fingers, (3,) [m]."""
-    return world.pose(TRAY).position + [0.0, 0.0, HAND_Z]
+    return world.at(TRAY) + [0.0, 0.0, HAND_Z]
 
 
 def is_in_drawer(world: World) -> bool:
     """Return whether the object is in the drawer."""
-    x, y, z = (world.pose(OBJECT).position - middle_of_drawer(world)).tolist()
+    x, y, z = (world.at(OBJECT) - middle_of_drawer(world)).tolist()
     return abs(x) < INSIDE[0] and abs(y) < INSIDE[1] and z < WALL + 0.01
 
 
@@ -132,15 +134,9 @@ def _yaw(world: World) -> float:
 
 
 def _at_bar(world: World) -> bool:
-    x, y, z = (world.ee.position - hand_at_handle(world)).tolist()
-    most_x, most_y, most_z, most_angle = AROUND
-    return (
-        abs(x) < most_x
-        and abs(y) < most_y
-        and abs(z) < most_z
-        and angle_from_down(world.ee.rotation, _yaw(world)) < most_angle
-        and world.opening < FINGERS + 0.012
-    )
+    is_near = is_inside((world.ee.position - hand_at_handle(world)).tolist(), AROUND)
+    angle = angle_from_down(world.ee.rotation, _yaw(world))
+    return is_near and angle < AROUND_ANGLE and world.opening < FINGERS + SPARE
 
 
 def _to_bar(world: World) -> Target:
@@ -149,10 +145,10 @@ def _to_bar(world: World) -> Target:
     bar = hand_at_handle(world)
     yaw = _yaw(world)
     off = math.hypot(*(bar - ee.position)[:2]) + 0.05 * max(0.0, angle_from_down(ee.rotation, yaw) - 0.1)
-    height = min(HOVER, SLOPE * max(0.0, off - 0.006))
-    if abs(world.opening - FINGERS) > 0.012:
+    height = FUNNEL.over(off)
+    if abs(world.opening - FINGERS) > SPARE:
         height = max(height, 0.05)
-    return Target(rise_first(ee.position, (*bar[:2], bar[2] + height)), hand_down(yaw), FINGERS)
+    return Target(rise_first(ee.position, bar + [0.0, 0.0, height]), hand_down(yaw), FINGERS)
 
 
 def _move_drawer(world: World, to: float) -> Target:
@@ -160,6 +156,14 @@ def _move_drawer(world: World, to: float) -> Target:
     way = pulled(world) - to
     step = way + math.copysign(SLACK, way)
     return Target(hand_at_handle(world) + [step, 0.0, 0.0], hand_down(_yaw(world)), FINGERS, max_step=_STEP)
+
+
+def _push(world: World) -> Target:
+    return _move_drawer(world, -0.01)
+
+
+def _let_go(world: World) -> Target:
+    return let_go(world, OBJECT, HOVER)
 
 
 def _is_shut(world: World) -> bool:
@@ -181,10 +185,9 @@ def _place(world: World) -> F64:
 
 def _leave(world: World) -> Target:
     """Rise straight up from the handle, opening the fingers above it."""
-    ee = world.ee.position
-    over = min(1.0, max(0.0, (ee[2] - BAR_Z) / LEFT[2]))
-    opening = FINGERS + over * (world.gripper.most - FINGERS)
-    return Target(np.array([ee[0], ee[1], BAR_Z + HOVER]), hand_down(_yaw(world)), opening)
+    x, y, z = world.ee.position
+    opening = FINGERS + share((z - BAR_Z) / LEFT[2]) * (world.gripper.most - FINGERS)
+    return Target(np.array([x, y, BAR_Z + HOVER]), hand_down(_yaw(world)), opening)
 
 
 def _is_around_bar(world: World) -> bool:
@@ -197,7 +200,7 @@ def _is_in_way(world: World, farthest: float = WAY_X[1]) -> bool:
 
     farthest: upper bound along the cabinet's x [m].
     """
-    x, y = (world.pose(OBJECT).position - world.pose(CABINET).position)[:2].tolist()
+    x, y, _ = world.at(OBJECT) - world.at(CABINET)
     return WAY_X[0] < x < farthest and abs(y) < WAY_Y
 
 
@@ -212,36 +215,37 @@ def _must_open(world: World) -> bool:
 
 
 def _is_set_down(world: World) -> bool:
-    low = world.pose(OBJECT).position[2] - lie_of(world, OBJECT).tall / 2
+    low = world.at(OBJECT)[2] - lie_of(world, OBJECT).tall / 2
     return low < 0.008 and not _is_in_way(world)
 
 
 def _put_aside(world: World) -> Target:
     """Carry the object to the table beside the drawer, on the side with more table."""
-    cabinet = world.pose(CABINET).position
-    side = math.copysign(ASIDE[1], world.scene.robot.workspace.centre[1] - cabinet[1])
-    to = np.array([cabinet[0] + ASIDE[0], cabinet[1] + side, lie_of(world, OBJECT).tall / 2])
+    cabinet = world.at(CABINET)
+    side = math.copysign(ASIDE[1], world.robot.workspace.centre[1] - cabinet[1])
+    to = cabinet + [ASIDE[0], side, lie_of(world, OBJECT).tall / 2]
     return carry(world, OBJECT, to, OVER_TABLE)
 
 
-class Drawer:
+class Drawer(Task):
     """Open a drawer, put a cube in it, close it."""
 
     name = "drawer"
     instruction = "Put the red cube in the drawer and close it."
-    limits = Limits(tolerance=SHUT, horizon=500)
+    tolerance = SHUT
+    horizon = 500
     objects = (OBJECT,)
     grasped = (OBJECT,)
     sizes = (0.03, 0.045)
     rungs = (
         Rung("done", lambda w: is_in_drawer(w) and _is_shut(w), _to_bar),
-        Rung("let_go", lambda w: is_in_drawer(w) and _hand_is_in(w), lambda w: let_go(w, OBJECT, HOVER)),
-        Rung("push", lambda w: is_in_drawer(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
+        Rung("let_go", lambda w: is_in_drawer(w) and _hand_is_in(w), _let_go),
+        Rung("push", lambda w: is_in_drawer(w) and _at_bar(w), _push),
         Rung("to_push", is_in_drawer, _to_bar),
-        Rung("carry", lambda w: held(w, OBJECT) and _is_open(w), lambda w: carry(w, OBJECT, _place(w), OVER_FRONT)),
-        Rung("set_down", lambda w: held(w, OBJECT) and _is_set_down(w), lambda w: let_go(w, OBJECT, HOVER)),
-        Rung("put_aside", lambda w: held(w, OBJECT), _put_aside),
-        Rung("make_way", lambda w: _must_shut(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
+        Rung("carry", lambda w: is_held(w, OBJECT) and _is_open(w), lambda w: carry(w, OBJECT, _place(w), OVER_FRONT)),
+        Rung("set_down", lambda w: is_held(w, OBJECT) and _is_set_down(w), _let_go),
+        Rung("put_aside", lambda w: is_held(w, OBJECT), _put_aside),
+        Rung("make_way", lambda w: _must_shut(w) and _at_bar(w), _push),
         Rung("to_make_way", _must_shut, _to_bar),
         Rung("pull", lambda w: _must_open(w) and _at_bar(w), lambda w: _move_drawer(w, OPEN)),
         Rung("to_pull", _must_open, _to_bar),
@@ -256,7 +260,7 @@ class Drawer:
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw where the cabinet stands, left or right, and the cube beside its drawer, at any yaw."""
-        x, y = world.scene.robot.workspace.centre
+        x, y = world.robot.workspace.centre
         side = rng.choice([-1.0, 1.0])
         cabinet = np.array([x + rng.uniform(0.03, 0.07), y + side * rng.uniform(0.05, 0.10), 0.0])
 
@@ -268,34 +272,31 @@ class Drawer:
 
     def observe(self, world: World) -> Observed:
         """Return hand, cube and handle, how far the drawer is open, and the vectors between them."""
-        ee = world.ee.position
         bar = hand_at_handle(world)
-        cube = world.pose(OBJECT).position
         return {
             **observe_hand(world),
             **observe_object(world, OBJECT),
             BAR: bar,
             "drawer.open": pulled(world),
-            "handle_from_ee": bar - ee,
-            "drawer_from_object": middle_of_drawer(world) - cube,
+            "handle_from_ee": bar - world.ee.position,
+            "drawer_from_object": middle_of_drawer(world) - world.at(OBJECT),
         }
 
     def error(self, world: World) -> float:
         """Return how far the drawer is open, plus the object's distance from the drawer's middle (0 if inside) [m]."""
-        missing = 0.0 if is_in_drawer(world) else math.dist(world.pose(OBJECT).position, middle_of_drawer(world))
+        missing = 0.0 if is_in_drawer(world) else math.dist(world.at(OBJECT), middle_of_drawer(world))
         return max(0.0, pulled(world)) + missing
 
     def progress(self, world: World) -> float:
         """Return progress of opening the drawer, putting the object in and closing it."""
-        opened = min(1.0, max(0.0, pulled(world) / OPEN))
+        opened = share(pulled(world) / OPEN)
+        at_handle = nearness(math.dist(world.ee.position, hand_at_handle(world)))
         if is_in_drawer(world):
             if _is_shut(world):
                 return 1.0
-            if _hand_is_in(world):
-                return 0.75
-            return 0.8 + 0.05 * nearness(math.dist(world.ee.position, hand_at_handle(world))) + 0.15 * (1 - opened)
-        if held(world, OBJECT) and _is_open(world):
+            return 0.75 if _hand_is_in(world) else 0.8 + 0.05 * at_handle + 0.15 * (1 - opened)
+        if is_held(world, OBJECT) and _is_open(world):
             return 0.5 + 0.25 * carry_progress(world, OBJECT, _place(world), OVER_FRONT)
         if _is_open(world):
             return 0.3 + 0.15 * grasp_progress(world, OBJECT)
-        return 0.1 * nearness(math.dist(world.ee.position, hand_at_handle(world))) + 0.2 * opened
+        return 0.1 * at_handle + 0.2 * opened

@@ -122,7 +122,7 @@ def lie_of(world: World, name: str) -> Lie:
 def grasp_of(world: World, name: str) -> Grasp:
     """Return the best grasp of an object from the hand's present pose."""
     ee = world.ee
-    position = world.pose(name).position
+    position = world.at(name)
     lie = lie_of(world, name)
     neighbours = world.neighbours(name)
     yaw, width, length, (off_x, off_y, off_z) = _nearest(
@@ -201,23 +201,14 @@ def _nearest(
             for way in (world.turns(yaw, math.pi, position) if lie.folds else (0.0,))
         ]
     narrowest = min([width for _, width, _, _ in grasps])
-    widest_fitting = max(widest, narrowest)
-    _, yaw, width, length, centre = min(
-        [
-            (
-                abs(yaw - at)
-                + PREFER_ZERO * abs(yaw)
-                + WIDTH_AS_ANGLE * (width - narrowest)
-                + CROWDED * _crowding(yaw + ahead, widest, neighbours),
-                yaw,
-                width,
-                length,
-                centre,
-            )
-            for yaw, width, length, centre in grasps
-            if width <= widest_fitting
-        ]
-    )
+
+    def cost(grasp: tuple[float, float, float, Way]) -> tuple[bool, float, float]:
+        yaw, width, _, _ = grasp
+        turn = abs(yaw - at) + PREFER_ZERO * abs(yaw) + WIDTH_AS_ANGLE * (width - narrowest)
+        too_wide = width > widest and width > narrowest
+        return too_wide, turn + CROWDED * _crowding(yaw + ahead, widest, neighbours), yaw
+
+    yaw, width, length, centre = min(grasps, key=cost)
     return yaw + ahead, width, length, centre
 
 
@@ -229,8 +220,8 @@ def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float
     worst = 0.0
     for x, y in neighbours:
         along, across = abs(s * x - c * y), abs(c * x + s * y)  # relative to the fingers' motion
-        lack = min(1.0, max(0.0, (widest / 2 + thick - along) / SHORT))
-        worst = max(worst, lack * min(1.0, max(0.0, (clear - across) / (clear - half))))
+        lack = share((widest / 2 + thick - along) / SHORT)
+        worst = max(worst, lack * share((clear - across) / (clear - half)))
     return worst
 
 
@@ -291,12 +282,17 @@ def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
     return Lie(grasps, extents[up], tilt, folds, level)
 
 
+def share(number: float) -> float:
+    """Return a number clipped to 0 to 1."""
+    return min(1.0, max(0.0, number))
+
+
 def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
     """Return the angle of a hand (3, 3) from pointing down [rad], less what it may lean (`lean`: 0 to 1)."""
     free = min(angle_off_vertical(hand), lean * LEAN)
     return math.sqrt(max(0.0, angle * angle - free * free))
 
 
-def is_inside(offset: Sequence[float], box: tuple[float, float, float]) -> bool:
+def is_inside(offset: Sequence[float] | F64, box: tuple[float, float, float]) -> bool:
     """Return whether an offset (3,) [m] is within a box's half lengths (3,) [m]."""
     return abs(offset[0]) <= box[0] and abs(offset[1]) <= box[1] and abs(offset[2]) <= box[2]

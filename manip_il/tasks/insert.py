@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -11,7 +11,7 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_across, angle_ahead, angle_between, angle_off_vertical
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of, once_per_state
 from manip_il.tasks.ladder import CLOSED, nearness
@@ -44,10 +44,8 @@ GUIDED = 0.003  # peg error up to which the chamfer guides it into the hole [m]
 AT_RIM, GENTLE = 0.005, 0.003  # within `AT_RIM` of the rim's height, the peg is lowered by at most `GENTLE` [m]
 EXACT = 0.02  # error below which the hand is placed exactly [m]
 IN = 0.003  # distance from the hole's floor at which the peg is inserted [m]
-# best yaws of a hand tilted by `TILTED` [rad]; weight of other yaws
-SIDES = (0.6, 1.75)
-TILTED = 0.5
-STRAIN = 4.0
+SIDES, TILTED = (0.6, 1.75), 0.5  # best yaws of a hand tilted by `TILTED` [rad]
+STRAIN = 4.0  # weight of other yaws
 NOT_NEARER = 0.10  # largest distance of the hole from the workspace's middle towards the robot, for a tilted hand [m]
 APART = 0.14  # least distance of peg and hole at the start [m]
 NOT_FARTHER = 0.05  # how far beyond the workspace's middle a lying peg may start [m]
@@ -56,7 +54,7 @@ _QUARTER = math.pi / 2
 
 def is_inserted(world: World) -> bool:
     """Return whether the peg has reached the hole's floor."""
-    return math.dist(lower_end(world), world.pose(HOLE).position) < IN
+    return math.dist(lower_end(world), world.at(HOLE)) < IN
 
 
 @once_per_state
@@ -67,7 +65,7 @@ def to_hole(world: World) -> Way:
     hand = world.ee.rotation
     in_hand = peg.rotation.T @ hand
     flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
-    turns = (_quarter(hole.rotation, k, flip) @ in_hand for k in range(4))
+    turns = (hole.rotation @ _quarter(k, flip) @ in_hand for k in range(4))
     best = min(turns, key=lambda turn: angle_between(hand, turn) + _strain(turn))
     return way_to(world, best, lambda world, end: hole.position)
 
@@ -79,9 +77,9 @@ def _strain(hand: F64) -> float:
     return (1 - tilted) * yaw + tilted * STRAIN * max(0.0, least - yaw, yaw - most)
 
 
-def _quarter(hole: F64, k: int, flip: float) -> F64:
+def _quarter(k: int, flip: float) -> F64:
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[k]
-    return hole @ np.array([[c, -s * flip, 0.0], [s, c * flip, 0.0], [0.0, 0.0, flip]])
+    return np.array([[c, -s * flip, 0.0], [s, c * flip, 0.0], [0.0, 0.0, flip]])
 
 
 def _is_entered(world: World) -> bool:
@@ -107,25 +105,25 @@ def _bring(world: World) -> Target:
     return move(world, way, missing, sideways_at=0.015 if far else math.inf, exact=way.error < EXACT)
 
 
-def _hold(world: World) -> Target:
+def _insert_or_stay(world: World) -> Target:
     if holds_peg(world):
         return _bring(world)
-    return Target(world.ee.position.copy(), world.ee.rotation.copy(), CLOSED)
+    return Target(*world.ee, CLOSED)
 
 
 @dataclass(frozen=True)
-class Insert:
+class Insert(Task):
     """Put a peg into a hole that it fits. play: how much wider the hole is than the peg [m]."""
 
     name: str = "insert"
     instruction: str = "Put the peg into the hole."
     play: float = 0.002
-    sizes: tuple[float, float] | None = None
-    limits: Limits = field(default=Limits(tolerance=0.004, horizon=600))
-    objects: tuple[str, ...] = (PEG,)
-    grasped: tuple[str, ...] = (PEG,)
-    rungs: tuple[Rung, ...] = (
-        Rung("inserted", is_inserted, _hold),
+    tolerance = 0.004
+    horizon = 600
+    objects = (PEG,)
+    grasped = (PEG,)
+    rungs = (
+        Rung("inserted", is_inserted, _insert_or_stay),
         Rung("insert", lambda w: hangs(w) and _lift(w) < DEPTH, _bring),
         Rung("carry", hangs, _bring),
         *PEG_RUNGS,
@@ -141,22 +139,20 @@ class Insert:
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw the hole's place and yaw, and the peg away from it, lying half of the time, at any yaw."""
-        centre = world.scene.robot.workspace.centre
+        centre = world.robot.workspace.centre
         side, _, length = world.extents(PEG)
 
-        nearest = centre[0] - NOT_NEARER
-        hole = draw_until(
-            lambda: draw_resting_place(rng, world, HOLE, 2 * DEPTH) * [1, 1, 0], lambda at: at[0] > nearest, world, HOLE
-        )
-        lies = rng.uniform() < 0.5
-        height = (side if lies else length) / 2
+        def draw_hole() -> F64:
+            return draw_resting_place(rng, world, HOLE, 2 * DEPTH) * [1, 1, 0]
 
-        farthest = centre[0] + (NOT_FARTHER if lies else math.inf)
+        hole = draw_until(draw_hole, lambda at: at[0] > centre[0] - NOT_NEARER, world, HOLE)
+        lies = rng.uniform() < 0.5
+        height, farthest = (side, centre[0] + NOT_FARTHER) if lies else (length, math.inf)
 
         def fits(at: F64) -> bool:
             return math.dist(at[:2], hole[:2]) > APART and at[0] < farthest
 
-        peg = draw_until(lambda: draw_resting_place(rng, world, PEG, height), fits, world, PEG)
+        peg = draw_until(lambda: draw_resting_place(rng, world, PEG, height / 2), fits, world, PEG)
         turn = draw_yaw(rng, np.pi)
         if lies:
             turn = product(turn, np.array([math.cos(_QUARTER / 2), 0.0, math.sin(_QUARTER / 2), 0.0]))
@@ -164,28 +160,25 @@ class Insert:
 
     def observe(self, world: World) -> Observed:
         """Return hand, peg, hole, the vectors between them, and the hand's remaining rotation vector [rad]."""
-        peg = world.pose(PEG).position
-        hole = world.pose(HOLE)
-        lie = lie_of(world, PEG)
-        yaw = angle_ahead(hole.rotation)
-        way = to_hole(world)
+        peg, hole = world.at(PEG), world.pose(HOLE)
+        peg_yaw, yaw = lie_of(world, PEG).yaw, angle_ahead(hole.rotation)
         return {
             **observe_hand(world),
             PEG: peg,
             "peg.axis": upper_axis(world),
-            "peg.cos4yaw": math.cos(4 * lie.yaw),
-            "peg.sin4yaw": math.sin(4 * lie.yaw),
+            "peg.cos4yaw": math.cos(4 * peg_yaw),
+            "peg.sin4yaw": math.sin(4 * peg_yaw),
             HOLE: hole.position,
             "hole.cos4yaw": math.cos(4 * yaw),
             "hole.sin4yaw": math.sin(4 * yaw),
             "peg_from_ee": peg - world.ee.position,
             "hole_from_peg": hole.position - lower_end(world),
-            "turn": way.turn,
+            "turn": to_hole(world).turn,
         }
 
     def error(self, world: World) -> float:
         """Return the distance of the peg's lower end from the middle of the hole's floor [m]."""
-        return math.dist(lower_end(world), world.pose(HOLE).position)
+        return math.dist(lower_end(world), world.at(HOLE))
 
     def progress(self, world: World) -> float:
         """Return progress of grasping, carrying and inserting, by the distance left."""
@@ -212,7 +205,6 @@ def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
     out, up = inner + CHAMFER / 2 + thick * math.sin(steep), height + CHAMFER / 2 - thick * math.cos(steep)
     add_part(hole, f"{name} edge", (CHAMFER / math.sqrt(2), inner + WALL, thick), (c * out, s * out, up), GREY)
     edge = hole.geoms[-1]
-    turn = product(turn_left(yaw), np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0]))
-    edge.quat = turn
+    edge.quat = product(turn_left(yaw), np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0]))
     edge.friction = [SLIPPERY, 0.005, 0.0001]
     edge.priority = 1

@@ -17,7 +17,7 @@ from manip_il.mdp import F64
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import CLOSING, HOVER, grasp_of, is_inside, lie_of
+from manip_il.tasks.grasp import CLOSING, HOVER, grasp_of, is_inside, lie_of, share
 
 Which = Callable[[World], str]  # returns the current object's name
 Place = Callable[[World], F64]  # returns the target of that object's centre, (3,) [m]
@@ -55,26 +55,23 @@ class LiftProfile(NamedTuple):
         return min(self.most, self.slope * max(0.0, distance - self.free))
 
 
-CARRY = LiftProfile()  # to a goal with nothing around it
+OVER_NOTHING = LiftProfile()  # to a goal with nothing around it
 
 
-def held(world: World, name: str) -> bool:
+def is_held(world: World, name: str) -> bool:
     """Return whether the object is between the fingers and each of them touches it."""
     x, y, z = IN_HAND
     half = max(world.extents(name)) / 2
-    if math.dist(world.pose(name).position.tolist(), world.ee.position.tolist()) > math.hypot(half + x, y, half + z):
+    if math.dist(world.at(name).tolist(), world.ee.position.tolist()) > math.hypot(half + x, y, half + z):
         return False  # too far away; grasps need not be computed
-    if world.hull(name) is not None:  # a mesh may be at any rotation in the hand
-        return _is_between(world, name, half) and world.touched(name)
-    g = grasp_of(world, name)
-    return is_inside(g.offset, (g.length / 2 + x, y, g.half + z)) and world.touched(name)
-
-
-def _is_between(world: World, name: str, half: float) -> bool:
-    """Whether the centre of a mesh of length 2 `half` [m] is between the fingers."""
-    (x, y, z), ee = IN_HAND, world.ee
-    across, along, ahead = (world.pose(name).position - ee.position).dot(ee.rotation).tolist()
-    return is_inside((across, along - world.gripper.middle(world.opening), ahead), (half + x, y, half + z))
+    if world.hull(name) is None:
+        g = grasp_of(world, name)
+        is_between = is_inside(g.offset, (g.length / 2 + x, y, g.half + z))
+    else:  # a mesh may be at any rotation in the hand
+        across, along, ahead = (world.at(name) - world.ee.position).dot(world.ee.rotation).tolist()
+        along -= world.gripper.middle(world.opening)
+        is_between = is_inside((across, along, ahead), (half + x, y, half + z))
+    return is_between and world.touched(name)
 
 
 def at_grasp(world: World, name: str) -> bool:
@@ -90,10 +87,10 @@ def at_grasp(world: World, name: str) -> bool:
     return is_inside(g.offset, box) and g.angle < AT_GRASP_ANGLE and g.settled
 
 
-def rise_first(at: F64, to: Sequence[float]) -> F64:
+def rise_first(at: F64, to: Sequence[float] | F64) -> F64:
     """Return the next target from a point (3,) towards another, (3,) [m]: straight up if far below the other."""
     (x, y, z), (to_x, to_y, to_z) = at.tolist(), to
-    sideways = min(1.0, max(0.0, 1.0 - (to_z - z) / RISE_FIRST))
+    sideways = share(1.0 - (to_z - z) / RISE_FIRST)
     return np.array([x + sideways * (to_x - x), y + sideways * (to_y - y), to_z])
 
 
@@ -120,12 +117,12 @@ def close_on(world: World, name: str) -> Target:
     return Target(at, hand_down(g.yaw), CLOSED, lean=g.lean)
 
 
-def carry(world: World, name: str, to: F64, lift: LiftProfile = CARRY) -> Target:
+def carry(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) -> Target:
     """Carry the held object's centre to a point (3,) [m]: first above that point, then down."""
-    x, y, z = (to - world.pose(name).position).tolist()
+    x, y, z = (to - world.at(name)).tolist()
     off = math.hypot(x, y)
     height = lift.over(off)
-    sideways = min(1.0, max(0.0, 1.0 - (z + height) / lift.rise_first)) if off > lift.free else 1.0
+    sideways = share(1.0 - (z + height) / lift.rise_first) if off > lift.free else 1.0
     position = world.ee.position + [sideways * x, sideways * y, z + height]
     position[2] = max(position[2], world.robot.ee.lowest)
     return Target(position, hand_down(world.ahead(position)), CLOSED, max_step=lift.max_step)
@@ -136,7 +133,7 @@ def let_go(world: World, name: str, height: float) -> Target:
     g, ee = grasp_of(world, name), world.ee
     beyond = min(RELEASE, world.gripper.most - g.width)
     free = world.opening > g.width + FREED * beyond and not world.touched(name)
-    up = world.pose(name).position[2] + height if free else ee.position[2]
+    up = world.at(name)[2] + height if free else ee.position[2]
     at = np.array([*ee.position[:2], up])
     if world.gripper.lopsided:  # the fixed jaw must move off the object, too
         along = g.offset[1] + world.gripper.middle(g.width) - world.gripper.middle(g.width + beyond)
@@ -146,7 +143,7 @@ def let_go(world: World, name: str, height: float) -> Target:
 
 def hand_is_at(world: World, name: str, aside: float, above: float) -> bool:
     """Return whether the hand is at an object, at most `aside` beside it and `above` over it [m]."""
-    x, y, z = (world.ee.position - world.pose(name).position).tolist()
+    x, y, z = (world.ee.position - world.at(name)).tolist()
     return math.hypot(x, y) < aside and z < above
 
 
@@ -174,14 +171,14 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
     """Return the ladder that grasps an object and carries it to the goal."""
 
     def at_goal(world: World) -> bool:
-        return held(world, name) and math.dist(world.pose(name).position.tolist(), world.goal.tolist()) < AT_GOAL
+        return is_held(world, name) and math.dist(world.at(name).tolist(), world.goal.tolist()) < AT_GOAL
 
     def to_goal(world: World) -> Target:
         return carry(world, name, world.goal)
 
     return (
         Rung("at_goal", at_goal, to_goal),
-        Rung("carry", lambda w: held(w, name), to_goal),
+        Rung("carry", lambda w: is_held(w, name), to_goal),
         *grasp_rungs(lambda w: name),
     )
 
@@ -196,17 +193,17 @@ def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.
 
 def pick_progress(world: World, name: str) -> float:
     """Return progress of grasping an object and carrying it to the goal, 0 to 1, by the distance left on that path."""
-    if held(world, name):
+    if is_held(world, name):
         return _GRASPED + (1 - _GRASPED) * carry_progress(world, name, world.goal)
     return 0.9 * _GRASPED * grasp_progress(world, name)
 
 
-def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = CARRY) -> float:
+def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) -> float:
     """Return progress of carrying a held object to a point (3,) [m], 0 to 1, by the distance left on `carry`'s path.
 
     That path goes up, sideways, and down.
     """
-    x, y, z = (to - world.pose(name).position).tolist()
+    x, y, z = (to - world.at(name)).tolist()
     off = math.hypot(x, y)
     height = lift.over(off)
     return nearness(abs(z + height) + off + height)

@@ -11,11 +11,11 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.reach import ARRIVES, reach_of
-from manip_il.robots.rotations import angle_across, angle_between, rotation_matrix, rotation_vector
+from manip_il.robots.rotations import angle_across, angle_between, rotation_matrix, rotation_vector, turn_about_z
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import SCENES_KEPT, Scene, World
-from manip_il.tasks.grasp import OPEN_SLACK, lie_of, once_per_state
-from manip_il.tasks.ladder import CLOSED, nearness, rise_first
+from manip_il.tasks.grasp import OPEN_SLACK, is_inside, lie_of, once_per_state, share
+from manip_il.tasks.ladder import CLOSED, LiftProfile, nearness, rise_first
 
 PEG, HOLE = "peg", "hole"
 _OPEN_SHARE = 0.85  # least opening beyond the peg, as a share of the most possible, if less than `OPEN_SLACK`
@@ -27,10 +27,8 @@ LEAN = math.radians(69)  # lean of the hand back over a lying peg's outer end, w
 LEAN_BY_ROOM = 3.0  # largest lean per distance to the end of the arm's reach: leaning moves the wrist outwards [rad/m]
 AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # errors up to which to close, to keep closing [m]
 AT_ANGLE = 0.25  # angle to the grip up to which to close [rad]
-# height over the grip on approach [m], and per error; tolerated error [m]
-OVER = 0.065
-SLOPE = 2.0
-FREE = 0.006
+OVER = 0.065  # greatest height over the grip on approach [m]
+FUNNEL = LiftProfile(OVER, slope=2.0, free=0.006)  # height over the grip, by the hand's misalignment
 BARE = 0.012  # how far outside the peg's faces and ends a hand that holds it may be [m]
 ASLANT = 0.75  # angle to the peg's axis above which the hand must set the peg up before carrying it [rad]
 LIFT, LIFT_SLOPE = 0.015, 2.5  # height of the peg's lower end over the rim [m]; height per error
@@ -68,10 +66,9 @@ class Grip(NamedTuple):
 def hand_at(yaw: float, pitch: float) -> F64:
     """Return `ee`'s rotation (3, 3): the hand points down at `pitch` 0, and level, along `yaw`, at pi/2 [rad]."""
     c, s = math.cos(yaw), math.sin(yaw)
-    along, up = np.array([c, s, 0.0]), np.array([0.0, 0.0, 1.0])
-    z = math.sin(pitch) * along - math.cos(pitch) * up
-    x = math.cos(pitch) * along + math.sin(pitch) * up
-    return np.array([x, [s, -c, 0.0], z]).T
+    level, upright = math.cos(pitch), math.sin(pitch)
+    x = [level * c, level * s, upright]
+    return np.array([x, [s, -c, 0.0], [upright * c, upright * s, -level]]).T
 
 
 def lower_end(world: World) -> F64:
@@ -140,12 +137,11 @@ def grip_of(world: World) -> Grip:
         room = _farthest(world.scene) - position[0]
         lean = min(LEAN, LEAN_BY_ROOM * max(0.0, room))
         rotation = hand_at(math.atan2(axis[1], axis[0]), -lean)
-    position = np.array([*position[:2], max(position[2], LOWEST)])
+    position[2] = max(position[2], LOWEST)
     angle = angle_between(ee.rotation, rotation)
     off = math.hypot(*(position - ee.position)[:2]) + 0.05 * max(0.0, angle - 0.1)
-    height = min(OVER, SLOPE * max(0.0, off - FREE))
     slack = min(OPEN_SLACK, _OPEN_SHARE * (world.gripper.most - width))
-    return Grip(position, rotation, off, angle, height, world.opening >= width + slack)
+    return Grip(position, rotation, off, angle, FUNNEL.over(off), world.opening >= width + slack)
 
 
 @lru_cache(SCENES_KEPT)
@@ -186,16 +182,13 @@ def to_stand(world: World) -> Way:
     """
     hand, axis = world.ee.rotation, upper_axis(world)
     upright = _upright(axis) @ hand
-    y, at = float(world.ee.position[1]) - world.scene.robot.workspace.centre[1], angle_across(hand)
+    y, at = float(world.ee.position[1]) - world.robot.workspace.centre[1], angle_across(hand)
     least, most = ASIDE
     yaw = min(
         (math.copysign(min(most, max(least, side * at)), side) for side in (1.0, -1.0)),
         key=lambda yaw: abs(yaw - at) + 8.0 * max(0.0, math.copysign(y, yaw * y)),
     )
-    turn = yaw - angle_across(upright)
-    c, s = math.cos(turn), math.sin(turn)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ upright
-    return way_to(world, rotation, _free_place)
+    return way_to(world, turn_about_z(yaw - angle_across(upright)) @ upright, _free_place)
 
 
 def _upright(axis: F64) -> F64:
@@ -210,11 +203,10 @@ def _upright(axis: F64) -> F64:
 def _free_place(world: World, end: F64) -> F64:
     """Place (3,) [m] on the table to set the peg up, nearest to where its lower end (3,) would be."""
     x, y, _ = end.tolist()
-    middle = world.scene.robot.workspace.centre[0]
+    middle = world.robot.workspace.centre[0]
     at = np.array([min(middle + NEAR_MIDDLE, max(middle - NEAR_MIDDLE, x)), y, 0.0])
-    from_hole = at - world.pose(HOLE).position
-    distance = math.hypot(from_hole[0], from_hole[1])
-    return at + max(0.0, FROM_HOLE / max(distance, 1e-6) - 1) * from_hole
+    from_hole = at - world.at(HOLE)
+    return at + max(0.0, FROM_HOLE / max(math.hypot(*from_hole[:2]), 1e-6) - 1) * from_hole
 
 
 def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
@@ -239,8 +231,8 @@ def _set_up(world: World) -> Target:
 
 def _set_up_height(world: World, way: Way) -> float:
     """Target height of the lower end over the table, greater near the walls of the hole [m]."""
-    room = math.dist(world.pose(PEG).position[:2], world.pose(HOLE).position[:2]) - FROM_HOLE
-    most = LIFT + OVER_WALLS * min(1.0, max(0.0, 1 - room / OVER_WALLS))
+    room = math.dist(world.at(PEG)[:2], world.at(HOLE)[:2]) - FROM_HOLE
+    most = LIFT + OVER_WALLS * share(1 - room / OVER_WALLS)
     tilt = math.acos(min(1.0, float(upper_axis(world)[2])))  # without the hand's yaw, which may be out of reach
     error = math.hypot(*way.off) + ANGLE_AS_LENGTH * tilt
     return min(most, LIFT_SLOPE * max(0.0, error - SET_DOWN)) - 0.001
@@ -251,7 +243,7 @@ def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool
 
     missing: height to gain [m]; sideways_at: missing height below which it moves sideways [m]; exact: see `Target`.
     """
-    sideways = min(1.0, max(0.0, 1.0 - missing / sideways_at))
+    sideways = share(1.0 - missing / sideways_at)
     turn = TURN * min(1.0, max(0.25, 1.0 - missing / 0.06))
     rotation = way.rotation
     if exact:
@@ -272,10 +264,9 @@ def _let_stand(world: World) -> Target:
     """Open the fingers, then rise straight up."""
     ee, width = world.ee, world.extents(PEG)[0]
     free = world.opening > width + LET_GO and not world.touched(PEG)
-    up = 0.1 if free else 0.0
-    return Target(
-        ee.position + [0.0, 0.0, up], ee.rotation.copy(), min(width + RELEASE, world.gripper.most), max_step=0.04
-    )
+    up = [0.0, 0.0, 0.1 if free else 0.0]
+    opening = min(width + RELEASE, world.gripper.most)
+    return Target(ee.position + up, ee.rotation, opening, max_step=0.04)
 
 
 def _falls(world: World) -> bool:
@@ -292,26 +283,24 @@ def _falls(world: World) -> bool:
 
 def _catch(world: World) -> Target:
     """Close the fingers and follow the peg."""
-    peg, ee = world.pose(PEG), world.ee
-    axis = upper_axis(world)
-    along = float(axis @ (ee.position - peg.position))
+    ee, axis = world.ee, upper_axis(world)
+    along = float(axis @ (ee.position - world.at(PEG)))
     down = (world.extents(PEG)[2] / 2 - FROM_END - along) * axis
-    return Target(ee.position + down, ee.rotation.copy(), CLOSED)
+    return Target(ee.position + down, ee.rotation, CLOSED)
 
 
 def _at_grip(world: World) -> bool:
     grip = grip_of(world)
     box = AT_GRIP if grip.open_enough else CLOSING
-    offset = np.abs(grip.rotation.T @ (world.ee.position - grip.position))
-    return bool((offset < box).all()) and grip.angle < AT_ANGLE
+    offset = grip.rotation.T @ (world.ee.position - grip.position)
+    return is_inside(offset, box) and grip.angle < AT_ANGLE
 
 
 def _approach(world: World) -> Target:
     """Move over the grip and down to it, fingers open; a hand too low beside it only rises."""
     grip = grip_of(world)
-    x, y, z = grip.position
-    height = grip.height if grip.open_enough else max(grip.height, OVER)
-    at = rise_first(world.ee.position, (x, y, z + height))
+    up = [0.0, 0.0, grip.height if grip.open_enough else OVER]
+    at = rise_first(world.ee.position, grip.position + up)
     return Target(at, grip.rotation, world.gripper.most, max_turn=TURN)
 
 
@@ -325,7 +314,7 @@ def peg_progress(world: World) -> float:
     grip = grip_of(world)
     above = float(world.ee.position[2] - grip.position[2])
     if is_up(world):
-        return 0.55 + 0.11 * min(1.0, max(0.0, above / (FROM_END + CLEAR)))
+        return 0.55 + 0.11 * share(above / (FROM_END + CLEAR))
     if holds_peg(world):
         way = to_stand(world)
         height = _set_up_height(world, way)

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.sim.shape import CUBE, Shape
-from manip_il.sim.task import CUBE_SIZES, Limits, Observed, Rung, Start
+from manip_il.sim.shape import CUBE, ObjectShape
+from manip_il.sim.task import CUBE_SIZES, Observed, Start, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.grasp import is_cube, lie_of
-from manip_il.tasks.ladder import held, pick_progress, pick_rungs
-from manip_il.tasks.objects import RED, add_cube, add_goal, add_object
+from manip_il.tasks.ladder import is_held, pick_progress, pick_rungs
+from manip_il.tasks.objects import CUBE_MASS, RED, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import FEW_DRAWS, LIFT, LIFT_HEIGHT, UPRIGHT, draw_goal, draw_lying, draw_until
 
 OBJECT = "object"
-ANY_SHAPE = Limits(horizon=200)  # small or rolling objects take more attempts than a cube
+ANY_SHAPE = 200  # horizon: small or rolling objects take more attempts than a cube
 
 
 @dataclass(frozen=True)
-class PickPlace:
+class PickPlace(Task):
     """Bring the object's centre to the goal. Ranges are those of gymnasium-robotics' FetchPickAndPlace.
 
     shape: shape of the object, a 5 cm cube unless `--task.object=` says otherwise.
@@ -32,26 +32,24 @@ class PickPlace:
 
     name: str = "pick_place"
     instruction: str = "Pick up the cube and bring it to the green goal."
-    limits: Limits = Limits()
-    objects: tuple[str, ...] = (OBJECT,)
-    grasped: tuple[str, ...] = (OBJECT,)
+    horizon: int = 100
+    objects = (OBJECT,)
+    grasped = (OBJECT,)
     sizes: tuple[float, float] | None = CUBE_SIZES
-    rungs: tuple[Rung, ...] = pick_rungs(OBJECT)
-    shape: Shape = CUBE
+    rungs = pick_rungs(OBJECT)
+    shape: ObjectShape = CUBE
 
-    def with_shape(self, shape: Shape) -> Self:
+    def with_shape(self, shape: ObjectShape) -> Self:
         """Return the task with another object, which its instruction also names."""
         instruction = self.instruction.replace(self.shape.word, shape.word)
-        limits = self.limits if shape == CUBE else ANY_SHAPE
-        return replace(self, shape=shape, sizes=shape.sizes, instruction=instruction, limits=limits)
+        horizon = self.horizon if shape == CUBE else ANY_SHAPE
+        return replace(self, shape=shape, sizes=shape.sizes, instruction=instruction, horizon=horizon)
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the object and the goal."""
-        if self.shape == CUBE:
-            add_cube(spec, OBJECT)
-        else:
-            shape = self.shape
-            add_object(spec, OBJECT, shape.kind, shape.size, shape.mass, RED, shape.mesh)
+        shape = self.shape
+        mass = CUBE_MASS if shape == CUBE else shape.mass
+        add_object(spec, OBJECT, shape.kind, shape.size, mass, RED, shape.mesh)
         add_goal(spec)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
@@ -62,17 +60,20 @@ class PickPlace:
 
     def observe(self, world: World) -> Observed:
         """Return hand, goal, the object as `observe_object` describes it, and the vectors between them."""
-        to_goal = world.goal - world.pose(OBJECT).position
-        seen = observe_object(world, OBJECT)
-        return {**observe_hand(world), "goal": world.goal, **seen, f"goal_from_{OBJECT}": to_goal}
+        return {
+            **observe_hand(world),
+            "goal": world.goal,
+            **observe_object(world, OBJECT),
+            f"goal_from_{OBJECT}": world.goal - world.at(OBJECT),
+        }
 
     def error(self, world: World) -> float:
         """Return the distance of the object's centre from the goal [m]."""
-        return math.dist(world.pose(OBJECT).position.tolist(), world.goal.tolist())
+        return math.dist(world.at(OBJECT).tolist(), world.goal.tolist())
 
     def unsound(self, world: World) -> str:
         """Return why there is no sound label (the mesh, as it lies, is too wide or too low for the gripper), or ""."""
-        if lie_of(world, OBJECT).fits or held(world, OBJECT):
+        if lie_of(world, OBJECT).fits or is_held(world, OBJECT):
             return ""
         return f"{OBJECT} lies on a side on which it is too low or too wide for the gripper"
 
@@ -87,24 +88,24 @@ class Lift(PickPlace):
 
     name: str = "lift"
     instruction: str = "Lift the cube to the green goal above it."
-    limits: Limits = Limits(horizon=150)
+    horizon: int = 150
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw the object on the table, lying or standing at any yaw, and the height of the goal over it."""
-        low, high = np.array(LIFT) * min(1.0, world.scene.robot.workspace.height / LIFT_HEIGHT)
+        low, high = np.array(LIFT) * min(1.0, world.robot.workspace.height / LIFT_HEIGHT)
 
-        def draw_both() -> tuple[Any, F64, F64]:
+        def draw_both() -> dict[str, tuple[F64, F64]]:
             at, turn = draw_lying(rng, world, OBJECT)
             goals = (at + [0.0, 0.0, rng.uniform(low, high)] for _ in range(FEW_DRAWS))
-            return next((goal for goal in goals if world.reach.has(goal)), None), at, turn
+            goal = next((goal for goal in goals if world.reach.has(goal)), None)
+            return {} if goal is None else {OBJECT: (at, turn), GOAL: (goal, UPRIGHT)}
 
-        goal, at, turn = draw_until(draw_both, lambda drawn: drawn[0] is not None, world, "the goal")
-        return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
+        return Start(draw_until(draw_both, bool, world, "the goal"))
 
 
 def observe_object(world: World, name: str) -> Observed:
     """Return an object's position, yaw modulo its symmetry, tilt and lengths, and the vector to it from the hand."""
-    position, lie = world.pose(name).position, lie_of(world, name)
+    position, lie = world.at(name), lie_of(world, name)
     if not world.scene.draws_shape and is_cube(world, name):
         seen: Observed = {
             f"{name}.cos4yaw": math.cos(4 * lie.yaw),

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 
 from manip_il.robots.rotations import hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
-from manip_il.tasks.ladder import CLOSED, nearness, rise_first
+from manip_il.tasks.ladder import CLOSED, LiftProfile, nearness, rise_first
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_part
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import draw_resting_place, draw_yaw
@@ -23,40 +23,35 @@ STOPPED = 0.002  # distance of the cap from its stop at which it is pressed [m]
 TIP = 0.02  # distance of the fingertips beyond `ee` [m]
 OVER = 0.012  # largest offset of the pressing hand from the button's middle [m]
 DEEPER = 0.012  # how far beyond the stop the hand aims, so that it presses [m]
-HOVER, SLOPE = 0.08, 2.0  # clearance over the cap before the hand is above it [m]; height per distance from it
+FUNNEL = LiftProfile(0.08, slope=2.0, free=OVER)  # clearance over the cap before the hand is above it
 _STIFF, _DAMPED = 150.0, 4.0  # stiffness and damping of the spring [N/m], [N s/m]
 
 
 def pressed(world: World) -> float:
     """Return how far the cap is pressed down [m]."""
-    return min(TRAVEL, max(0.0, TOP - float(world.pose(CAP).position[2])))
+    return min(TRAVEL, max(0.0, TOP - float(world.at(CAP)[2])))
 
 
 def _off(world: World) -> float:
     """Horizontal distance of the hand from the button [m]."""
-    x, y = (world.ee.position - world.pose(BUTTON).position)[:2].tolist()
-    return math.hypot(x, y)
+    return math.hypot(*(world.ee.position - world.at(BUTTON))[:2].tolist())
 
 
 def _aim(world: World) -> Target:
     """Go over the button, descending on the way; once above it, press beyond its stop."""
     off = _off(world)
-    x, y, _ = world.pose(BUTTON).position
-    height = min(HOVER, SLOPE * max(0.0, off - OVER)) if off > OVER else -TRAVEL - DEEPER
-    height += TOP + TIP
-    at = rise_first(world.ee.position, (x, y, height))
+    x, y, _ = world.at(BUTTON)
+    height = FUNNEL.over(off) if off > OVER else -TRAVEL - DEEPER
+    at = rise_first(world.ee.position, (x, y, height + (TOP + TIP)))
     return Target(at, hand_down(world.ahead(at)), CLOSED)
 
 
-class Press:
+class Press(Task):
     """Press a button to its stop against its spring, and keep it there for a moment."""
 
     name = "press"
     instruction = "Press the red button."
-    limits = Limits(tolerance=STOPPED)
-    objects = ()
-    grasped = ()
-    sizes = None
+    tolerance = STOPPED
     rungs = (
         Rung("pressed", lambda w: TRAVEL - pressed(w) < STOPPED, _aim),
         Rung("press", lambda w: _off(w) < OVER, _aim),
@@ -86,7 +81,7 @@ class Press:
 
     def observe(self, world: World) -> Observed:
         """Return the hand, the middle of the cap's top, and the vector from hand to cap."""
-        cap = world.pose(CAP).position
+        cap = world.at(CAP)
         return {**observe_hand(world), CAP: cap, "cap_from_ee": cap - world.ee.position}
 
     def error(self, world: World) -> float:
@@ -95,9 +90,9 @@ class Press:
 
     def progress(self, world: World) -> float:
         """Return progress of getting over the button and pressing it."""
-        if pressed(world) > STOPPED and _off(world) < OVER:
-            return 0.7 + 0.3 * pressed(world) / TRAVEL
         off = _off(world)
+        if pressed(world) > STOPPED and off < OVER:
+            return 0.7 + 0.3 * pressed(world) / TRAVEL
         above = max(0.0, float(world.ee.position[2]) - TOP - TIP)
-        height = min(HOVER, SLOPE * max(0.0, off - OVER))
+        height = FUNNEL.over(off)
         return 0.7 * nearness(off + abs(above - height) + height)

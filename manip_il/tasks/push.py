@@ -10,9 +10,10 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.ladder import AT_GOAL, nearness, rise_first
+from manip_il.tasks.grasp import share
+from manip_il.tasks.ladder import AT_GOAL, LiftProfile, nearness, rise_first
 from manip_il.tasks.objects import RED, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_xy, resting_height
@@ -24,8 +25,8 @@ PUSHING = (0.01, 0.12)  # range of the pushing hand's distance behind the puck's
 BESIDE = 0.02  # largest distance of the pushing hand from the line through puck and goal [m]
 LOW = 0.004  # height of the pushing hand over its lowest position [m]
 LOW_ENOUGH = 0.025  # the hand pushes below this height over `LOW` [m]
-ABOVE = 0.10  # height of the hand on its way around the puck [m]
-SLOPE = 2.0  # height of the hand per distance from its place behind the puck
+FUNNEL = LiftProfile(0.10, slope=2.0, free=0.01)  # height of the hand on its way around the puck
+NEAR = 0.05  # distance from its place behind the puck at which the hand descends [m]
 STEP = 0.03  # how far ahead of the hand its target runs while it pushes [m]
 FAR = 0.08  # least distance of the goal from the puck at the start [m]
 ROOM = 0.06  # reachable margin behind the puck at the start [m]
@@ -54,14 +55,14 @@ def _style(world: World) -> PushStyle:
 
 def _way(world: World) -> tuple[F64, float]:
     """Direction from puck to goal on the table (2,) and the distance [m]."""
-    way = (world.goal - world.pose(PUCK).position)[:2]
+    way = (world.goal - world.at(PUCK))[:2]
     distance = math.hypot(*way)
     return (way / distance if distance > 1e-9 else np.array([1.0, 0.0])), distance
 
 
 def _across(world: World, direction: F64) -> F64:
     """Rotation of a downward hand with its fingers across the push, the nearer of two, (3, 3)."""
-    yaw, puck = math.atan2(direction[1], direction[0]), world.pose(PUCK).position
+    yaw, puck = math.atan2(direction[1], direction[0]), world.at(PUCK)
     if world.robot.faces_ahead:
         at, turns = world.turned(puck), world.turns(yaw, math.pi, puck)
     else:
@@ -83,7 +84,7 @@ def _to(world: World, position: F64, direction: F64, max_step: float = 0.12) -> 
 def _behind(world: World) -> tuple[float, float]:
     """Distances of the hand behind the puck on the line to the goal, and beside that line [m]."""
     direction, _ = _way(world)
-    x, y = (_hand(world) - world.pose(PUCK).position)[:2].tolist()
+    x, y = (_hand(world) - world.at(PUCK))[:2].tolist()
     return -(x * direction[0] + y * direction[1]), abs(x * direction[1] - y * direction[0])
 
 
@@ -93,31 +94,26 @@ def _at_goal(world: World) -> bool:
 
 def _stay(world: World) -> Target:
     """Hold the hand where it is."""
-    return Target(world.ee.position.copy(), world.ee.rotation.copy(), _style(world).opening)
+    return Target(*world.ee, _style(world).opening)
 
 
 def _pushes(world: World) -> bool:
-    behind, beside = _behind(world)
+    (behind, beside), style = _behind(world), _style(world)
     nearest, farthest = PUSHING
-    return nearest < behind < farthest and beside < BESIDE and world.ee.position[2] < _low_enough(world, behind)
-
-
-def _low_enough(world: World, behind: float) -> float:
-    """Height of `ee` below which a hand pushes [m]. behind: the hand's distance behind the puck's middle [m]."""
-    style = _style(world)
-    apart = min(1.0, max(0.0, (behind - style.touching) / (style.behind - style.touching)))
-    return world.robot.ee.lowest + LOW + LOW_ENOUGH - (LOW_ENOUGH - style.lower) * apart
+    apart = share((behind - style.touching) / (style.behind - style.touching))
+    low_enough = world.robot.ee.lowest + LOW + LOW_ENOUGH - (LOW_ENOUGH - style.lower) * apart
+    return nearest < behind < farthest and beside < BESIDE and world.ee.position[2] < low_enough
 
 
 def _place_behind(world: World) -> F64:
     """Place of a hand that starts to push, (2,) [m]."""
-    return world.pose(PUCK).position[:2] - _way(world)[0] * _style(world).behind
+    return world.at(PUCK)[:2] - _way(world)[0] * _style(world).behind
 
 
 def _push(world: World) -> Target:
     direction, distance = _way(world)
     behind, _ = _behind(world)
-    on_line = world.pose(PUCK).position[:2] - direction * behind
+    on_line = world.at(PUCK)[:2] - direction * behind
     ahead = on_line + direction * (distance + max(0.0, behind - _style(world).behind))
     return _to(world, np.append(ahead, world.robot.ee.lowest + LOW), direction, STEP)
 
@@ -126,22 +122,21 @@ def _around(world: World) -> Target:
     """Move over the puck to behind it, descending on the way; a hand too low beside it only rises."""
     hand, to = _hand(world), _place_behind(world)
     off = math.hypot(*(to - hand[:2]))
-    height = world.robot.ee.lowest + LOW + min(ABOVE, SLOPE * max(0.0, off - 0.01))
+    height = world.robot.ee.lowest + LOW + FUNNEL.over(off)
     return _to(world, rise_first(hand, (*to, height)), _way(world)[0])
 
 
 def _near(world: World) -> bool:
-    return math.hypot(*(_place_behind(world) - _hand(world)[:2])) < ABOVE / SLOPE
+    return math.hypot(*(_place_behind(world) - _hand(world)[:2])) < NEAR
 
 
-class Push:
+class Push(Task):
     """Push a puck to a goal. The goal is flat, and the puck is moved by contact alone."""
 
     name = "push"
     instruction = "Push the puck to the green goal."
-    limits = Limits(horizon=200)
+    horizon = 200
     objects = (PUCK,)
-    grasped = ()
     sizes = (0.055, 0.07)
     rungs = (
         Rung("at_goal", _at_goal, _stay),
@@ -169,7 +164,7 @@ class Push:
 
     def observe(self, world: World) -> Observed:
         """Return hand, goal and puck, and the vectors between them."""
-        puck, goal = world.pose(PUCK).position, world.goal
+        puck, goal = world.at(PUCK), world.goal
         seen = {"goal": goal, PUCK: puck, "puck_from_ee": puck - world.ee.position, "goal_from_puck": goal - puck}
         return {**observe_hand(world), **seen}
 

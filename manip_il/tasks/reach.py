@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from manip_il.robots.rotations import hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.ladder import AT_GOAL, CLOSED, nearness
 from manip_il.tasks.objects import CUBE_HALF, add_goal
@@ -16,18 +16,14 @@ from manip_il.tasks.starts import UPRIGHT, draw_goal
 
 
 def _to_goal(world: World) -> Target:
-    return Target(world.goal.copy(), hand_down(world.ahead(world.goal)), CLOSED)
+    return Target(world.goal, hand_down(world.ahead(world.goal)), CLOSED)
 
 
-class ReachGoal:
+class ReachGoal(Task):
     """Bring `ee` to the goal."""
 
     name = "reach"
     instruction = "Move the hand to the green goal."
-    limits = Limits()
-    objects = ()
-    grasped = ()
-    sizes = None
     rungs = (
         Rung("at_goal", lambda w: math.dist(w.goal, w.ee.position) < AT_GOAL, _to_goal),
         Rung("carry", lambda w: True, _to_goal),

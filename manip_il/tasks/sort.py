@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, OVER_WALL, WALL, add_bin, drop_place, drop_rungs, is_in, rise_over
-from manip_il.tasks.grasp import grasp_of, lie_of, once_per_state
-from manip_il.tasks.ladder import CLEAR, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
+from manip_il.tasks.grasp import grasp_of, lie_of, once_per_state, share
+from manip_il.tasks.ladder import CLEAR, CLOSED, approach, grasp_progress, grasp_rungs, is_held, nearness
 from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, add_furniture
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
@@ -51,7 +52,7 @@ _WRONG = 0.1  # error for each other cube in a bin [m]
 @once_per_state
 def asked(world: World) -> str:
     """Return the name of the cube that the instruction names."""
-    return list(COLOURS)[round(float(world.pose(ASKED).position[0]))]
+    return list(COLOURS)[round(float(world.at(ASKED)[0]))]
 
 
 def _is_sorted(world: World, name: str) -> bool:
@@ -60,8 +61,8 @@ def _is_sorted(world: World, name: str) -> bool:
 
 def _wrong(world: World) -> int:
     """Number of other cubes that are in a bin."""
-    others = [name for name in COLOURS if name != asked(world)]
-    return sum(any(is_in(world, name, one, INSIDE) for one in BINS.values()) for name in others)
+    others = COLOURS.keys() - {asked(world)}
+    return sum(is_in(world, name, box, INSIDE) for name in others for box in BINS.values())
 
 
 def _place(world: World) -> F64:
@@ -71,45 +72,38 @@ def _place(world: World) -> F64:
 
 def _to(world: World) -> F64:
     """Release point of the named cube, (3,) [m]; shifted off the row of bins until the cube is beside its bin."""
-    name = asked(world)
-    place = _place(world)
-    along = abs(place[0] - world.pose(name).position[0])
-    inwards = math.copysign(1.0, world.scene.robot.workspace.centre[1] - place[1])
+    name, place = asked(world), _place(world)
+    along = abs(place[0] - world.at(name)[0])
+    inwards = math.copysign(1.0, world.robot.workspace.centre[1] - place[1])
     return place + [0.0, inwards * min(FROM_BINS, SLOPE * max(0.0, along - INSIDE[0] / 2)), 0.0]
-
-
-def _carry_progress(world: World) -> float:
-    """Progress, 0 to 1, by the distance left around the other bins and the height still to gain."""
-    along, across, up = (_place(world) - world.pose(asked(world)).position).tolist()
-    lift = OVER_WALL.over(max(0.0, math.hypot(along, across) - INSIDE[0]))
-    return nearness(abs(along) + abs(across) + max(0.0, up + lift))
 
 
 def _other_held(world: World) -> str:
     """Name of the wrong cube in the hand; "" if there is none."""
-    return next((name for name in COLOURS if name != asked(world) and held(world, name)), "")
+    return next((name for name in COLOURS if name != asked(world) and is_held(world, name)), "")
 
 
 def _put_back(world: World) -> Target:
     """Move a wrong cube away from the bins, lower it to the table and open the fingers."""
     name = _other_held(world) or asked(world)
-    at, ee = world.pose(name).position, world.ee.position
-    low = at[2] - lie_of(world, name).tall / 2
-    centre, row = world.scene.robot.workspace.centre[1], world.pose(BINS[name]).position[1]
-    inwards = FROM_BINS - abs(at[1] - row)  # distance to move until it is off the bins
-    if inwards <= 0:
-        return Target(ee - [0.0, 0.0, max(0.0, low)], hand_down(0.0), CLOSED if low > 0.008 else world.gripper.most)
-    missing = WALL + _HIGH - low
-    sideways = min(1.0, max(0.0, 1.0 - missing / 0.03)) * math.copysign(inwards + 0.02, centre - row)
-    return Target(ee + [0.0, sideways, missing], hand_down(0.0), CLOSED)
+    _, y, z = world.at(name)
+    low = z - lie_of(world, name).tall / 2
+    centre, row = world.robot.workspace.centre[1], world.at(BINS[name])[1]
+    inwards = FROM_BINS - abs(y - row)  # distance to move until it is off the bins
+    way, opening = [0.0, 0.0, -max(0.0, low)], CLOSED if low > 0.008 else world.gripper.most
+    if inwards > 0:
+        missing = WALL + _HIGH - low
+        sideways = share(1.0 - missing / 0.03) * math.copysign(inwards + 0.02, centre - row)
+        way, opening = [0.0, sideways, missing], CLOSED
+    return Target(world.ee.position + way, hand_down(0.0), opening)
 
 
 def _free_yaw(world: World) -> float | None:
     """Yaw at which walls leave room for the fingers, modulo half a turn [rad]; None if there is room all around."""
-    x, y = world.pose(asked(world)).position[:2].tolist()
-    row = [world.pose(one).position for one in BINS.values()]
-    off = abs(y - row[0][1])
-    beyond = max(min(float(at[0]) for at in row) - x, x - max(float(at[0]) for at in row)) - PITCH / 2
+    x, y, _ = world.at(asked(world)).tolist()
+    along, across, _ = np.array([world.at(one) for one in BINS.values()]).T.tolist()
+    off = abs(y - across[0])
+    beyond = max(min(along) - x, x - max(along)) - PITCH / 2
     if off > INSIDE[1] + BY_WALL or beyond > BY_WALL:
         return None
     return 0.0 if beyond > 0.0 or off < INSIDE[1] - NEAR_WALL else math.pi / 2
@@ -122,16 +116,15 @@ def _approach(world: World, name: str, hover: float) -> Target:
         return target
     ee, g = world.ee, grasp_of(world, name)
     hand = angle_ahead(ee.rotation)
-    yaw = min((one for one, _, _, _ in lie_of(world, name).grasps),
-              key=lambda one: (round(abs(math.sin(one - free)), 6), abs(one - hand)))  # fmt: skip
+    yaws = (yaw for yaw, _, _, _ in lie_of(world, name).grasps)
+    yaw = min(yaws, key=lambda yaw: (round(abs(math.sin(yaw - free)), 6), abs(yaw - hand)))
     low = g.at[2] + g.half + CLEAR if angle_from_down(ee.rotation, yaw) > TURNED else 0.0
-    position = np.array([*target.position[:2], max(target.position[2], low)])
-    return Target(position, hand_down(yaw), g.width + NARROW)
+    return Target(np.maximum(target.position, [-np.inf, -np.inf, low]), hand_down(yaw), g.width + NARROW)
 
 
 def _middle(world: World) -> tuple[float, float]:
     """Middle (x, y) [m] of cubes and bins, chosen so that the arm can also pick up a dropped cube."""
-    x, y = world.scene.robot.workspace.centre
+    x, y = world.robot.workspace.centre
     line = [(across, height) for across in (-0.2, -0.1, 0.0, 0.1, 0.2) for height in (0.03, 0.15)]
     shifts = [
         shift
@@ -144,7 +137,7 @@ def _middle(world: World) -> tuple[float, float]:
 
 def _draw_place(rng: np.random.Generator, world: World, name: str, side: float) -> F64:
     """Draw a cube's resting place, (3,) [m], away from the bins. side: where the bins are, -1 (right) or 1 (left)."""
-    (x, y), wide = _middle(world), world.scene.robot.workspace.half_width
+    (x, y), wide = _middle(world), world.robot.workspace.half_width
     along, across = rng.uniform(-1, 1) * wide, side * rng.uniform(-BEYOND, SIDE - FROM_BINS)
     return np.array([x + along, y + across, resting_height(world, name)])
 
@@ -152,12 +145,13 @@ def _draw_place(rng: np.random.Generator, world: World, name: str, side: float) 
 _LET_GO, _CARRY = drop_rungs(asked, _to, _is_sorted, tuple(COLOURS), OVER_WALL._replace(max_step=STEP))
 
 
-class Sort:
+class Sort(Task):
     """Put the cube that the instruction names into the bin of its colour, and leave the others on the table."""
 
     name = "sort"
     instruction = "Put the cube that is named into the bin of its colour."
-    limits = Limits(tolerance=0.005, horizon=250)
+    tolerance = 0.005
+    horizon = 250
     objects = tuple(COLOURS)
     grasped = tuple(COLOURS)
     sizes = (0.03, 0.04)
@@ -171,7 +165,7 @@ class Sort:
 
     def instruction_in(self, world: World) -> str:
         """Return the instruction of a world's episode."""
-        number = round(float(world.pose(ASKED).position[2])) % len(SENTENCES)
+        number = round(float(world.at(ASKED)[2])) % len(SENTENCES)
         return SENTENCES[number].format(colour=asked(world))
 
     def objects_in(self, world: World) -> tuple[str, ...]:
@@ -180,7 +174,7 @@ class Sort:
 
     def unsound(self, world: World) -> str:
         """Return "the bins do not stand in a row" if some bins were moved without the others, else ""."""
-        bins = np.array(sorted(world.pose(one).position.tolist() for one in BINS.values()))
+        bins = np.array(sorted(world.at(one).tolist() for one in BINS.values()))
         row = bins[0] + np.outer(np.arange(len(bins)), [PITCH, 0.0, 0.0])
         return "" if np.abs(bins - row).max() < _IN_ROW else "the bins do not stand in a row"
 
@@ -195,18 +189,18 @@ class Sort:
         """Draw which cube is named, the sentence, the bins' side and order, and the cubes, apart and at any yaw."""
         number, sentence = float(rng.integers(len(COLOURS))), float(rng.integers(len(SENTENCES)))
         poses: dict[str, tuple[F64, F64]] = {ASKED: (np.array([number, 0.0, sentence]), UPRIGHT)}
-        (x, y), hand = _middle(world), world.scene.robot.workspace.centre
+        (x, y), hand = _middle(world), world.robot.workspace.centre
         side = rng.choice([-1.0, 1.0])
         for place, name in enumerate(rng.permutation(list(BINS.values())).tolist()):
             poses[name] = np.array([x + PITCH * (place - 1), y + side * SIDE, 0.0]), UPRIGHT
+
+        def fits(at: F64) -> bool:
+            others = [poses[name][0] for name in COLOURS if name in poses]
+            from_hand = math.dist(at[:2], hand) > FROM_HAND
+            return from_hand and world.reach.has(at) and all(math.dist(at, other) > APART for other in others)
+
         for name in COLOURS:
-            others = [poses[other][0] for other in COLOURS if other in poses]
-
-            def fits(at: F64, others: list[F64] = others) -> bool:
-                from_hand = math.dist(at[:2], hand) > FROM_HAND
-                return from_hand and world.reach.has(at) and all(math.dist(at, other) > APART for other in others)
-
-            at = draw_until(lambda name=name: _draw_place(rng, world, name, side), fits, world, name)
+            at = draw_until(partial(_draw_place, rng, world, name, side), fits, world, name)
             poses[name] = at, draw_yaw(rng)
         return Start(poses)
 
@@ -217,23 +211,25 @@ class Sort:
             **observe_hand(world),
             **{f"{ASKED}.{other}": float(other == name) for other in COLOURS},
             **{key.replace(name, "cube", 1): value for key, value in observe_object(world, name).items()},
-            "bin_from_cube": world.pose(BINS[name]).position - world.pose(name).position,
-            "place_from_cube": _to(world) - world.pose(name).position,
-            **{other: world.pose(other).position for other in COLOURS},
-            **{one: world.pose(one).position for one in BINS.values()},
+            "bin_from_cube": world.at(BINS[name]) - world.at(name),
+            "place_from_cube": _to(world) - world.at(name),
+            **{other: world.at(other) for other in COLOURS},
+            **{one: world.at(one) for one in BINS.values()},
         }
 
     def error(self, world: World) -> float:
         """Return the named cube's distance from its bin's middle [m], 0 inside, plus 0.1 m per other cube in a bin."""
         name = asked(world)
-        off = math.dist(world.pose(name).position, world.pose(BINS[name]).position)
+        off = math.dist(world.at(name), world.at(BINS[name]))
         return (0.0 if _is_sorted(world, name) else off) + _WRONG * _wrong(world)
 
     def progress(self, world: World) -> float:
-        """Return progress of grasping the named cube and bringing it to its bin."""
+        """Return progress of grasping the named cube and bringing it to its bin around the others."""
         name = asked(world)
         if _is_sorted(world, name):
             return 1.0 if not _wrong(world) else 0.95
-        if held(world, name):
-            return 0.5 + 0.4 * _carry_progress(world)
+        if is_held(world, name):
+            along, across, up = (_place(world) - world.at(name)).tolist()
+            lift = OVER_WALL.over(max(0.0, math.hypot(along, across) - INSIDE[0]))
+            return 0.5 + 0.4 * nearness(abs(along) + abs(across) + max(0.0, up + lift))
         return 0.45 * grasp_progress(world, name, OVER)

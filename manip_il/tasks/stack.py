@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import grasp_of, lie_of
-from manip_il.tasks.ladder import LiftProfile, carry, carry_progress, grasp_progress, grasp_rungs, held, let_go
+from manip_il.tasks.ladder import LiftProfile, carry, carry_progress, grasp_progress, grasp_rungs, is_held, let_go
 from manip_il.tasks.objects import BLUE, RED, add_cube
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
@@ -34,7 +34,7 @@ _HAND = 0.05  # error added while the hand is at the cube [m]
 def place_on_base(world: World) -> F64:
     """Return the target of the upper cube's centre, (3,) [m]."""
     height = (lie_of(world, BASE).tall + lie_of(world, TOP).tall) / 2
-    return world.pose(BASE).position + [0.0, 0.0, height]
+    return world.at(BASE) + [0.0, 0.0, height]
 
 
 def stands(world: World) -> bool:
@@ -48,32 +48,36 @@ def _rests(world: World) -> bool:
 
 
 def _is_on_base(world: World, height: float) -> bool:
-    x, y, z = (world.pose(TOP).position - place_on_base(world)).tolist()
+    x, y, z = (world.at(TOP) - place_on_base(world)).tolist()
     return math.hypot(x, y) < ON_XY and abs(z) < height
 
 
 def _hand_is_away(world: World) -> bool:
-    g = grasp_of(world, TOP)
-    return bool(world.ee.position[2] > world.pose(TOP).position[2] + g.half + AWAY_ENOUGH)
+    return bool(world.ee.position[2] > world.at(TOP)[2] + grasp_of(world, TOP).half + AWAY_ENOUGH)
+
+
+def _carry(world: World) -> Target:
+    return carry(world, TOP, place_on_base(world) - [0.0, 0.0, PRESS], OVER_BASE)
 
 
 def _let_go(world: World) -> Target:
     return let_go(world, TOP, grasp_of(world, TOP).half + AWAY)
 
 
-class Stack:
+class Stack(Task):
     """Put the red cube on the blue one and let go: it must stand by itself for a second."""
 
     name = "stack"
     instruction = "Stack the red cube on the blue cube."
-    limits = Limits(success_steps=20, horizon=400)
+    success_steps = 20
+    horizon = 400
     objects = (TOP, BASE)
     grasped = (TOP,)
     sizes = (0.03, 0.07)
     rungs = (
         Rung("done", lambda w: stands(w) and _hand_is_away(w), _let_go),
         Rung("let_go", lambda w: stands(w) or _rests(w), _let_go),
-        Rung("carry", lambda w: held(w, TOP), lambda w: carry(w, TOP, place_on_base(w) - [0.0, 0.0, PRESS], OVER_BASE)),
+        Rung("carry", lambda w: is_held(w, TOP), _carry),
         *grasp_rungs(lambda w: TOP),
     )
 
@@ -99,20 +103,18 @@ class Stack:
             **observe_hand(world),
             **observe_object(world, TOP),
             **observe_object(world, BASE),
-            "place_from_top": place_on_base(world) - world.pose(TOP).position,
+            "place_from_top": place_on_base(world) - world.at(TOP),
         }
 
     def error(self, world: World) -> float:
         """Return the cube's distance from its place on the base [m], plus 0.05 m until it stands without the hand."""
-        off = math.dist(world.pose(TOP).position, place_on_base(world))
+        off = math.dist(world.at(TOP), place_on_base(world))
         return off + (0.0 if stands(world) and _hand_is_away(world) else _HAND)
 
     def progress(self, world: World) -> float:
         """Return progress of grasping, carrying and letting go."""
         if stands(world):
-            if _hand_is_away(world):
-                return 1.0
-            return 0.9 + 0.1 * min(1.0, world.opening / world.gripper.most)
-        if held(world, TOP):
+            return 1.0 if _hand_is_away(world) else 0.9 + 0.1 * min(1.0, world.opening / world.gripper.most)
+        if is_held(world, TOP):
             return 0.5 + 0.4 * carry_progress(world, TOP, place_on_base(world), OVER_BASE)
         return 0.45 * grasp_progress(world, TOP)

@@ -46,10 +46,9 @@ def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, 
 
 def _upright(down: F64) -> F64:
     """Return the smallest rotation, wxyz, that makes a direction (3,) of an object point down."""
-    turn, upright = np.empty(4), np.empty(4)
+    turn = np.empty(4)
     mujoco.mju_quatZ2Vec(turn, -down)
-    mujoco.mju_negQuat(upright, turn)
-    return upright
+    return turn * [1.0, -1.0, -1.0, -1.0]
 
 
 def _sides(kind: int, lengths: Sequence[float]) -> list[int]:
@@ -69,22 +68,19 @@ def draw_resting_place(rng: np.random.Generator, world: World, name: str, height
 
     room: margin around the place [m] that must also be within reach, so that a knocked object stays within reach.
     """
-    space = world.scene.robot.workspace
+    space = world.robot.workspace
     centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
-
-    def draw() -> F64:
-        return np.append(draw_xy(rng, world), height)
 
     def fits(at: F64) -> bool:
         around = ((0, 0, 0), (room, 0, 0), (-room, 0, 0), (0, room, 0), (0, -room, 0))
         return bool(np.linalg.norm(at[:2] - centre) >= apart) and all(world.reach.has(at + way) for way in around)
 
-    return draw_until(draw, fits, world, name)
+    return draw_until(lambda: np.append(draw_xy(rng, world), height), fits, world, name)
 
 
 def draw_goal(rng: np.random.Generator, world: World, height: float, in_air: float = IN_AIR) -> F64:
     """Draw a goal at `height` over the table or, with probability `in_air`, anywhere above that; (3,) [m]."""
-    top = world.scene.robot.workspace.height if rng.uniform() < in_air else 0.0
+    top = world.robot.workspace.height if rng.uniform() < in_air else 0.0
     return draw_until(
         lambda: np.append(draw_xy(rng, world), height + rng.uniform(0, top)), world.reach.has, world, "the goal"
     )
@@ -113,7 +109,10 @@ def draw_until[T](draw: Callable[[], T], fits: Callable[[T], bool], world: World
         drawn = draw()
         if fits(drawn):
             return drawn
-    raise _no_place(world, what)
+    raise UsageError(
+        f"task {world.scene.task.name}: none of {_MOST_DRAWS} places drawn for {what} fits within reach of"
+        f" {world.robot.name}; choose another task or robot"
+    )
 
 
 def draw_together(
@@ -123,24 +122,18 @@ def draw_together(
 
     Raises `UsageError` after a thousand attempts.
     """
-    for _ in range(_MOST_DRAWS):
+
+    def draw_all() -> list[F64]:
         places: list[F64] = []
         for name in names:
             drawn = (draw(name) for _ in range(FEW_DRAWS))
             at = next((at for at in drawn if fits(at, places)), None)
             if at is None:
-                break
+                return []
             places.append(at)
-        else:
-            return places
-    raise _no_place(world, ", ".join(names))
+        return places
 
-
-def _no_place(world: World, what: str) -> UsageError:
-    return UsageError(
-        f"task {world.scene.task.name}: none of {_MOST_DRAWS} places drawn for {what} fits within reach of"
-        f" {world.scene.robot.name}; choose another task or robot"
-    )
+    return draw_until(draw_all, bool, world, ", ".join(names))
 
 
 def resting_height(world: World, name: str) -> float:
@@ -150,5 +143,5 @@ def resting_height(world: World, name: str) -> float:
 
 def draw_xy(rng: np.random.Generator, world: World) -> F64:
     """Draw x and y in the workspace, (2,) [m]."""
-    space = world.scene.robot.workspace
+    space = world.robot.workspace
     return np.array(space.centre) + rng.uniform(-1, 1, 2) * space.half_width

@@ -18,8 +18,8 @@ from typing import Any
 from manip_il import checks
 from manip_il.errors import OWN, UnknownName, UsageError
 from manip_il.option import NameOrPath
-from manip_il.sim.shape import Shape
-from manip_il.sim.task import TakesArgument, TakesShape, Task
+from manip_il.sim.shape import ObjectShape
+from manip_il.sim.task import Task
 from manip_il.tasks.carry.task import Carry
 from manip_il.tasks.clear_table import ClearTable
 from manip_il.tasks.drawer import Drawer
@@ -33,10 +33,6 @@ from manip_il.tasks.stack import Stack
 
 SUFFIX = ".py"
 GROUP = "manip_il.tasks"  # entry-point group: maps a task's name to its class
-_MEMBERS = (
-    *("name", "instruction", "limits", "objects", "grasped", "sizes", "rungs"),
-    *("build", "draw", "observe", "error", "progress"),
-)
 TASKS: dict[str, Task] = {
     "reach": ReachGoal(),
     "lift": Lift(),
@@ -58,7 +54,7 @@ def get_task(name: NameOrPath, shape: NameOrPath = "") -> Task:
 
     Args:
         name: A name or, as `option.typed` returns it, the `Path` of a Python file, or of a `carry:reward.json`.
-        shape: The object's, as `Shape.parse` reads it; empty for the task's default.
+        shape: The object's, as `ObjectShape.parse` reads it; empty for the task's default.
 
     Raises:
         UnknownName: if no task has this name.
@@ -70,23 +66,13 @@ def get_task(name: NameOrPath, shape: NameOrPath = "") -> Task:
         base, colon, argument = str(name).partition(":")
         task = _named(base)
         if colon:
-            if not isinstance(task, TakesArgument):
-                raise UsageError(
-                    f"task is {checks.shorten(str(name))}, but only {_who(TakesArgument)} takes an argument after a "
-                    "colon"
-                )
             task = task.with_argument(Path(argument) if isinstance(name, Path) else argument)
-    if shape and not isinstance(task, TakesShape):
-        raise UsageError(
-            f"object is {checks.shorten(str(shape))}, but the objects of {name} are fixed; only {_who(TakesShape)} "
-            "take others"
-        )
     return _shaped(task, shape) if shape else task
 
 
 @cache  # the same text gives the same task, so that its scene is built once
-def _shaped(task: TakesShape, shape: NameOrPath) -> Task:
-    return task.with_shape(Shape.parse(shape))
+def _shaped(task: Task, shape: NameOrPath) -> Task:
+    return task.with_shape(ObjectShape.parse(shape))
 
 
 def is_task(name: str) -> bool:
@@ -135,10 +121,10 @@ def _of_file(path: Path) -> Task:
         del sys.modules[name]
         raise UsageError(f"{path} cannot be run: {type(error).__name__}: {checks.one_line(error)}") from error
     own = [one for one in vars(module).values() if inspect.isclass(one) and one.__module__ == name]
-    tasks = [one for one in own if hasattr(one, "rungs") and not one.__name__.startswith("_")]
+    tasks = [cls for cls in own if issubclass(cls, Task) and not cls.__name__.startswith("_")]
     if len(tasks) != 1:
         found = ", ".join(one.__name__ for one in tasks) or "none"
-        raise UsageError(f"tasks in {path}: {found}; expected exactly one class with `rungs` (docs/new-task.md)")
+        raise UsageError(f"tasks in {path}: {found}; expected one subclass of manip_il.task.Task (docs/new-task.md)")
     task = _made(f"{path}: task {tasks[0].__name__}", tasks[0])
     if task.name in TASKS:
         raise UsageError(f"{path}: its task has a built-in task's name, {task.name!r}; choose another")
@@ -146,18 +132,10 @@ def _of_file(path: Path) -> Task:
 
 
 def _made(what: str, cls: Any) -> Task:
-    if lacks := [name for name in _MEMBERS if not hasattr(cls, name)]:
-        raise UsageError(f"{what} lacks {', '.join(lacks)}; docs/new-task.md says what each is for")
     try:
         task = cls()
         checks.name("its name", task.name)
-        for member in ("objects", "grasped"):
-            if isinstance(named := getattr(task, member), str):
-                raise UsageError(f"{member} is {named!r}; expected a tuple of names")
+        _ = task.instruction, task.rungs  # both must be there
     except Exception as error:
         raise UsageError(f"{what}: {checks.one_line(error)}") from error
     return task
-
-
-def _who(protocol: type) -> str:
-    return ", ".join(name for name, task in TASKS.items() if isinstance(task, protocol))

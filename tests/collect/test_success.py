@@ -51,7 +51,7 @@ def test_the_expert_solves_a_task_whatever_the_cube(robot: str, task: str, condi
 def test_the_expert_recovers(robot: str, task: str, kind: str, at: int):
     seed = stream_seeds("certificate", 20)[at]
     config, condition = (
-        make_config(robot, task, horizon=at + TASKS[task].limits.horizon),
+        make_config(robot, task, horizon=at + TASKS[task].horizon),
         Perturbation(kind, {seed: at}),
     )
     [episode] = RolloutJob(config, hold=0, conditions=(condition,)).run([seed])

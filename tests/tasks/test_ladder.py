@@ -64,6 +64,9 @@ class Placed:
     def pose(self, name: str) -> Pose:
         return {"object": self.cube}[name]
 
+    def at(self, name: str) -> np.ndarray:
+        return self.pose(name).position
+
     def extents(self, name: str) -> tuple[float, ...]:
         return (self.edge,) * 3
 

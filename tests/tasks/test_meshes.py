@@ -21,7 +21,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UsageError
 from manip_il.sim.rests import LEAST_ROOM
-from manip_il.sim.shape import DENSITY, LIGHTEST, Shape
+from manip_il.sim.shape import DENSITY, LIGHTEST, ObjectShape
 from manip_il.sim.world import World
 from manip_il.tasks.config import make_config, stored_config
 from manip_il.tasks.envs import make_env, scene_of
@@ -61,7 +61,7 @@ def test_other_tasks_take_it_too(task, folder):
 def test_every_kind_of_file_is_the_same_solid(ending, tmp_path):
     path, solid = tmp_path / f"angle{ending}", MESHES["angle"]()
     solid.export(path, file_type="stl_ascii" if "ascii" in ending else None)
-    shape = Shape.parse(Path(f"mesh:{path}:0.05"))
+    shape = ObjectShape.parse(Path(f"mesh:{path}:0.05"))
     assert max(shape.lengths) == pytest.approx(0.05)
     assert shape.mass == pytest.approx(max(LIGHTEST, DENSITY * solid.volume * (0.05 / 0.07) ** 3), rel=1e-5)
     np.testing.assert_allclose(shape.mesh.vertices.min(axis=0), np.array((-0.0275, -0.0225, -0.0125)) / 1.4, atol=1e-6)
@@ -69,7 +69,7 @@ def test_every_kind_of_file_is_the_same_solid(ending, tmp_path):
 
 def test_the_model_has_its_mass_its_centre_of_mass_and_its_picture(folder):
     bottle = Path(text(folder, "bottle"))
-    shape, scene = Shape.parse(bottle), scene_of("panda", "pick_place", bottle)
+    shape, scene = ObjectShape.parse(bottle), scene_of("panda", "pick_place", bottle)
     one, model = scene.objects[OBJECT], scene.model
     assert model.body_mass[one.body] == pytest.approx(shape.mass) == pytest.approx(DENSITY * MESHES["bottle"]().volume)
     np.testing.assert_allclose(model.body_ipos[one.body], 0, atol=1e-5)

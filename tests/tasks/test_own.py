@@ -63,13 +63,12 @@ def test_a_task_that_fits_itself_to_the_arm_is_that_task_throughout(tmp_path):
 
 CYLINDER = """
 from dataclasses import dataclass
-from manip_il.sim.shape import Shape
-from manip_il.tasks.pick_place import PickPlace
+from manip_il.task import ObjectShape, PickPlace
 
 @dataclass(frozen=True)
 class Tin(PickPlace):
     name: str = "tin"
-    shape: Shape = Shape.parse("cylinder:0.04x0.06")
+    shape: ObjectShape = ObjectShape.parse("cylinder:0.04x0.06")
 """
 
 
@@ -165,12 +164,18 @@ def test_a_node_gets_the_file(touch):
 
 MISTAKES = {
     "is not Python": ("def (", "cannot be run: SyntaxError"),
-    "lacks a function": (TOUCH.replace("def observe(", "def observed("), "task Touch lacks observe"),
+    "lacks a function": (
+        TOUCH.replace("def observe(", "def observed("),
+        "without an implementation for abstract method 'observe'",
+    ),
     "another object": (
         TOUCH.replace('objects = ("cube",)', 'objects = ("cubes",)'),
         "unknown object of task touch 'cubes'",
     ),
-    "one name": (TOUCH.replace("    def draw(", '    grasped = "cube"\n\n    def draw('), "expected a tuple of names"),
+    "one name": (
+        TOUCH.replace("    def draw(", '    grasped = "cube"\n\n    def draw('),
+        "unknown object of task touch 'c'",
+    ),
     "observes two": (
         TOUCH.replace('"cube": cube,', '"cube": cube[:2],'),
         "cube has shape (2,); expected a number or (3,)",

@@ -13,7 +13,7 @@ from manip_il.collect.scenes import SceneDrawer, Scenes
 from manip_il.mdp import State
 from manip_il.sim.env import environment_state_names
 from manip_il.sim.events import move_object
-from manip_il.sim.task import instruction_in, phases
+from manip_il.sim.task import phases
 from manip_il.sim.world import World
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import make_env
@@ -84,7 +84,7 @@ def test_an_episodes_text_is_that_of_its_state(robot: str):
     for episode in RolloutJob(make_config(robot, "sort", horizon=6)).run(STARTS[:3]):
         state = State.from_vector(episode.columns["sim_state"][-1])
         world.restore(state.physics, state.variation)
-        assert episode.instruction == instruction_in(TASKS["sort"], world)
+        assert episode.instruction == TASKS["sort"].instruction_in(world)
 
 
 @every_large_robot

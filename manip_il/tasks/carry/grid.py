@@ -18,7 +18,7 @@ from manip_il.mdp import F64, I64
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.tasks.carry.layout import Layout, Reward
-from manip_il.tasks.carry.paths import PathProblem, cheapest_path, plan
+from manip_il.tasks.carry.paths import PathProblem, Plan, cheapest_path, plan
 
 CELL = 0.02  # grid spacing, at full scale [m]
 BEYOND = 0.09  # how far the grid extends beyond the workspace's half width, at full scale [m]
@@ -44,17 +44,30 @@ class _Links(NamedTuple):
 
 
 @lru_cache(4)
-def _links(shape: tuple[int, int, int]) -> _Links:
+def _links(shape: tuple[int, ...]) -> _Links:
     steps = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)]) - 1
-    places = np.argwhere(np.ones(shape, bool))[:, None]
+    places = _indices(shape)[:, None]
     to = places + steps
     inside = ((to >= 0) & (to < shape)).all(axis=2)
-    start = np.broadcast_to(places, to.shape)[inside]
-    end, step = to[inside], np.broadcast_to(steps, to.shape)[inside]
-    fine = tuple(2 * count - 1 for count in shape)
-    nodes = [np.ravel_multi_index(tuple(one.T), shape) for one in (start, end)]
-    doubled = [np.ravel_multi_index(tuple(one.T), fine) for one in (2 * start, 2 * start + step, 2 * end)]
-    return _Links(np.stack(nodes, axis=1), np.stack(doubled, axis=1), np.linalg.norm(step, axis=1))
+    start, end = np.broadcast_to(places, to.shape)[inside], to[inside]
+    nodes = [_numbers(index, shape) for index in (start, end)]
+    doubled = [_numbers(index, _finer(shape)) for index in (2 * start, start + end, 2 * end)]
+    return _Links(np.stack(nodes, axis=1), np.stack(doubled, axis=1), np.linalg.norm(end - start, axis=1))
+
+
+def _finer(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Shape of a grid twice as fine."""
+    return tuple(2 * count - 1 for count in shape)
+
+
+def _indices(shape: tuple[int, ...]) -> I64:
+    """Indices (S, 3) of all nodes along x, y and z."""
+    return np.argwhere(np.ones(shape, bool))
+
+
+def _numbers(index: I64, shape: tuple[int, ...]) -> I64:
+    """Numbers (n,) of the nodes with indices (n, 3)."""
+    return np.asarray(np.ravel_multi_index(tuple(index.T), shape), np.int64)
 
 
 class Grid:
@@ -73,19 +86,18 @@ class Grid:
         before = np.floor((goal - low) / self.cell + 1e-9).astype(np.int64)  # nodes before the goal
         self.origin = goal - self.cell * before
         counts = np.maximum(np.floor(sizes / self.cell + 1e-9).astype(np.int64), before) + 1
-        self.shape: tuple[int, int, int] = tuple(counts.tolist())
-        self.goal = int(np.ravel_multi_index(tuple(before.clip(0)), self.shape))
+        self.shape: tuple[int, ...] = tuple(counts.tolist())
+        self.goal = int(_numbers(before.clip(0), self.shape))
 
     @cached_property
     def points(self) -> F64:
         """Places of the nodes, (S, 3) [m]."""
-        return self.origin + self.cell * np.argwhere(np.ones(self.shape, bool))
+        return self.origin + self.cell * _indices(self.shape)
 
     @cached_property
     def _fine(self) -> F64:
         """Places of nodes and of the points halfway between them, (F, 3) [m]."""
-        fine = tuple(2 * count - 1 for count in self.shape)
-        return self.origin + self.cell / 2 * np.argwhere(np.ones(fine, bool))
+        return self.origin + self.cell / 2 * _indices(_finer(self.shape))
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -121,18 +133,18 @@ class Grid:
     def costs_to_go(self, weights: F64) -> F64:
         """Return the cost of the cheapest path to the goal from every node, (S,), for weights (K,)."""
         costs = self._integrals(self.layout.densities(self._fine) @ weights)
-        problem = PathProblem(self._links.edges, costs[:, None], len(self.points), self.goal)
-        return plan(problem, np.ones(1)).costs
+        return self._plan(costs, self.goal)[1].costs
 
-    def _number(self, index: I64) -> I64:
-        """Numbers (n,) of the nodes with indices (n, 3) along x, y and z."""
-        return np.array(np.ravel_multi_index(tuple(index.T), self.shape), np.int64)
+    def _plan(self, costs: F64, goal: int) -> tuple[PathProblem, Plan]:
+        """The cheapest paths to a node for costs (E,) of the edges."""
+        problem = PathProblem(self._links.edges, costs[:, None], len(self.points), goal)
+        return problem, plan(problem, np.ones(1))
 
     def near(self, position: F64) -> I64:
         """Return the free nodes within `AHEAD` cells of a position (3,) [m], (n,)."""
         around = np.round((position - self.origin) / self.cell).astype(np.int64) + _AROUND
         inside = around[((around >= 0) & (around < self.shape)).all(axis=1)]
-        nodes = self._number(inside)
+        nodes = _numbers(inside, self.shape)
         nodes = nodes[self.free[nodes]]
         return nodes[np.linalg.norm(self.points[nodes] - position, axis=1) < AHEAD * self.cell]
 
@@ -144,7 +156,7 @@ class Grid:
         """
         dense = _dense(positions, self.cell / 4)
         index = np.round((dense - self.origin) / self.cell).astype(np.int64).clip(0, np.array(self.shape) - 1)
-        every = self._number(index)
+        every = _numbers(index, self.shape)
         nodes: list[int] = every[self.free[every]].tolist()
         if np.linalg.norm(positions[-1] - self.points[self.goal]) < AHEAD * self.cell:
             nodes.append(self.goal)
@@ -159,8 +171,7 @@ class Grid:
         return np.array(path, np.int64)
 
     def _between(self, start: int, end: int) -> list[int]:
-        lengths = PathProblem(self._links.edges, self._links.cells[:, None], len(self.points), end)
-        return cheapest_path(lengths, plan(lengths, np.ones(1)), start)[0][1:].tolist()
+        return cheapest_path(*self._plan(self._links.cells, end), start)[0][1:].tolist()
 
 
 _AROUND = np.array([step for step in np.ndindex(*[2 * AHEAD + 1] * 3)]) - AHEAD
@@ -225,22 +236,19 @@ class Descent:
         ends = ends[free]
         totals = totals[free]
         off = off[free]
-        return float(totals.min()), self._heading(position, price, nodes, ends, totals, off, spare)
+        # The mean of the best nodes, farther ones preferred, changes smoothly with the position.
+        near = AHEAD * self.grid.cell - off
+        late = totals + np.where(nodes == self.grid.goal, 0.0, _SHORT * price * near)
+        shares = np.exp(-(late - late.min()) / (_STEEP * layout.scale * price))
+        shares *= np.clip(near / self.grid.cell, 0.0, 1.0) + 1e-6
+        mean = shares @ ends / shares.sum()
+        if not layout.is_free(position, mean, spare):
+            mean = ends[int(np.argmin(late))]
+        return float(totals.min()), mean
 
     def _prices(self, points: F64) -> F64:
         """Return what a metre of path costs at points (N, 3), (N,)."""
         return self.grid.layout.densities(points) @ self.weights
-
-    def _heading(self, position: F64, price: float, nodes: I64, ends: F64, totals: F64, off: F64, spare: float) -> F64:
-        """Mean of the best nodes, farther ones preferred, so that it changes smoothly with the position, (3,) [m]."""
-        layout, radius = self.grid.layout, AHEAD * self.grid.cell
-        late = np.where(nodes == self.grid.goal, 0.0, _SHORT * price * (radius - off))
-        shares = np.exp(-(totals + late - (totals + late).min()) / (_STEEP * layout.scale * price))
-        shares *= np.clip((radius - off) / self.grid.cell, 0.0, 1.0) + 1e-6
-        mean = shares @ ends / shares.sum()
-        if layout.is_free(position, mean, spare):
-            return mean
-        return ends[int(np.argmin(totals + late))]
 
 
 @lru_cache(KEPT)

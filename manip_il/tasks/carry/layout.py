@@ -59,8 +59,8 @@ STEP = 0.005  # half the spacing of the points at which a line's room is checked
 class Edge(NamedTuple):
     """Edge of the table: a point on it (x, y) [m], and the unit vector away from the table."""
 
-    at: tuple[float, float]
-    outwards: tuple[float, float]
+    at: tuple[float, ...]
+    outwards: tuple[float, ...]
 
 
 class Part(NamedTuple):
@@ -80,8 +80,8 @@ class Layout:
     """
 
     scale: float
-    goal: tuple[float, float, float]
-    places: tuple[tuple[str, tuple[float, float]], ...]
+    goal: tuple[float, ...]
+    places: tuple[tuple[str, tuple[float, ...]], ...]
     edge: Edge | None
     half: float
     parts: tuple[Part, ...]
@@ -144,14 +144,6 @@ def _bump(off: F64, width: float) -> F64:
     return np.exp(-0.5 * np.square(off / width))
 
 
-def path_features(layout: Layout, positions: F64) -> F64:
-    """Return the features of a path of the object's centre, (T, 3) [m], as line integrals along it, (K,)."""
-    pieces, steps = 20, np.diff(positions, axis=0)
-    points = positions[:-1, None] + (np.arange(pieces) + 0.5)[:, None] / pieces * steps[:, None]
-    densities = layout.densities(points.reshape(-1, 3)).reshape(len(steps), pieces, -1).mean(axis=1)
-    return np.linalg.norm(steps, axis=1) @ densities
-
-
 @dataclass(frozen=True)
 class Reward:
     """Weights, in the order of `FEATURES`: each is the cost of a metre of path on which its feature is 1.
@@ -172,9 +164,8 @@ class Reward:
     @classmethod
     def of(cls, weights: Mapping[str, float]) -> Reward:
         """Return a reward from weights by feature, 0 by default. Raises `UnknownName` for an unknown feature."""
-        for name in weights:
-            if name not in FEATURES:
-                raise UnknownName("feature", name, FEATURES)
+        if unknown := [name for name in weights if name not in FEATURES]:
+            raise UnknownName("feature", unknown[0], FEATURES)
         return cls(tuple(weights.get(name, 0.0) for name in FEATURES))
 
     @classmethod
@@ -201,12 +192,7 @@ class Reward:
     def numbers(self) -> str:
         """The nonzero weights as `NAME=NUMBER,...`, not rounded."""
         pairs = zip(FEATURES, self.weights, strict=True)
-        return ",".join(f"{name}={_short(weight)}" for name, weight in pairs if weight)
-
-
-def _short(weight: float) -> str:
-    short = f"{weight:g}"
-    return short if float(short) == weight else repr(weight)
+        return ",".join(f"{name}={repr(weight).removesuffix('.0')}" for name, weight in pairs if weight)
 
 
 TASTES: dict[str, Reward] = {

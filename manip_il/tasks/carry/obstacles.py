@@ -81,18 +81,18 @@ def scale_of(scene: Scene) -> float:
 @once_per_state
 def reward_in(world: World) -> Reward:
     """Return the reward of an episode."""
-    return Reward(tuple(number for name in TASTE_BODIES for number in world.pose(name).position.tolist()))
+    return Reward(tuple(number for name in TASTE_BODIES for number in world.at(name).tolist()))
 
 
 def is_there(world: World, name: str) -> bool:
     """Return whether an obstacle, or the table's edge, is part of an episode."""
-    return bool(world.pose(name).position[2] > -PARKED / 2)
+    return bool(world.at(name)[2] > -PARKED / 2)
 
 
 @once_per_state
 def layout_of(world: World, name: str) -> Layout:
     """Return the layout of an episode in which an object is carried to the goal."""
-    places = {obstacle: world.pose(obstacle).position for obstacle in OBSTACLES if is_there(world, obstacle)}
+    places = {obstacle: world.at(obstacle) for obstacle in OBSTACLES if is_there(world, obstacle)}
     edge, turn = world.pose(EDGE)
     seen = (edge, turn[:, 0]) if is_there(world, EDGE) else None
     return make_layout(world.scene, world.extents(name), world.goal, places, seen)
@@ -109,17 +109,12 @@ def make_layout(
     own = Part(-longest / 2, math.hypot(middle, longest) / 2)
     return Layout(
         scale=scale_of(scene),
-        goal=_numbers(goal),
-        places=tuple((name, _numbers(places[name])[:2]) for name in OBSTACLES if name in places),
-        edge=None if edge is None else Edge(_numbers(edge[0])[:2], _numbers(edge[1])[:2]),
+        goal=tuple(goal.tolist()),
+        places=tuple((name, tuple(places[name][:2].tolist())) for name in OBSTACLES if name in places),
+        edge=edge and Edge(*(tuple(vector[:2].tolist()) for vector in edge)),
         half=longest / 2,
         parts=(own, *hand_of(scene).parts),
     )
-
-
-def _numbers(vector: F64) -> tuple[float, float, float]:
-    x, y, z = vector.tolist()
-    return x, y, z
 
 
 def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layout:
@@ -139,8 +134,8 @@ def observe_obstacles(world: World) -> dict[str, F64 | float]:
     """Return all obstacles' positions [m] and presence, and the table's edge: a point on it, its outward axis."""
     found: dict[str, F64 | float] = {}
     for name in (*OBSTACLES, EDGE):
-        found |= {name: world.pose(name).position, f"{name}.here": float(is_there(world, name))}
-    return {**found, f"{EDGE}.outwards": world.pose(EDGE).rotation[:, 0]}
+        found |= {name: world.at(name), f"{name}.here": float(is_there(world, name))}
+    return found | {f"{EDGE}.outwards": world.pose(EDGE).rotation[:, 0]}
 
 
 class Box(NamedTuple):
@@ -179,18 +174,18 @@ def hand_of(scene: Scene) -> HandShape:
         for geom in range(model.ngeom)
         if model.geom_bodyid[geom] in moved and (model.geom_contype[geom] or model.geom_conaffinity[geom])
     ]
-    lean = LEANING if scene.robot.leans else 0.0
-    return HandShape(_parts(outlines, lean), tuple(_box(points, axes) for points in outlines), ee.copy())
+    parts = _parts(outlines, LEANING if scene.robot.leans else 0.0)
+    return HandShape(parts, tuple(_box(points, axes) for points in outlines), ee.copy())
 
 
 def _parts(outlines: Sequence[F64], lean: float) -> tuple[Part, ...]:
-    found = [(points[:, 2].min(), np.hypot(points[:, 0], points[:, 1]).max() + lean) for points in outlines]
     parts: list[Part] = []
+    found = ((float(z.min()), float(np.hypot(x, y).max()) + lean) for x, y, z in map(np.transpose, outlines))
     for bottom, radius in sorted(found):
         if not parts or radius > parts[-1].radius + _ALIKE:
-            parts.append(Part(float(bottom), float(radius)))
+            parts.append(Part(bottom, radius))
         else:
-            parts[-1] = parts[-1]._replace(radius=max(float(radius), parts[-1].radius))
+            parts[-1] = Part(parts[-1].bottom, max(radius, parts[-1].radius))
     return tuple(parts)
 
 
@@ -200,7 +195,7 @@ def _box(points: F64, axes: F64) -> Box:
     return Box(float(points[:, 2].min()), (low + high) / 2, (high - low) / 2)
 
 
-def fits(hand: HandShape, at: F64, yaw: float, layout: Layout) -> bool:
+def fits(hand: HandShape, at: Sequence[float], yaw: float, layout: Layout) -> bool:
     """Return whether a downward hand, `ee` at a place (3,) [m] and a yaw [rad], is clear of a layout's obstacles."""
     axes = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])  # the hand's x and y
     for _, middle, half, height in layout.boxes:
@@ -208,10 +203,9 @@ def fits(hand: HandShape, at: F64, yaw: float, layout: Layout) -> bool:
             if at[2] + box.bottom > height + _BARELY:
                 continue
             way = at[:2] + box.middle @ axes - middle
-            turned = np.abs(axes)
-            apart = np.abs(way) - half - box.half @ turned - _BARELY
-            across = np.abs(axes @ way) - box.half - turned @ half - _BARELY
-            if max(apart.max(), across.max()) < 0:
+            apart = np.abs(way) - half - box.half @ np.abs(axes)
+            across = np.abs(axes @ way) - box.half - np.abs(axes) @ half
+            if max(apart.max(), across.max()) < _BARELY:
                 return False
     return True
 

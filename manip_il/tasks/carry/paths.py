@@ -18,7 +18,6 @@ from scipy.sparse.csgraph import dijkstra
 from manip_il.errors import ManipError
 from manip_il.mdp import F64, I64
 
-NOWHERE = -1  # stands for "no next node"
 LENGTH = 0  # feature that every edge has; other weights are given relative to its weight
 _EVERY, _FEW = 5, 5  # the first stage takes every fifth demonstration, if that leaves at least five
 _DIGITS = 6  # decimals [m] to which the features of equal paths agree
@@ -52,24 +51,19 @@ class PathProblem:
         numbers = self.numbers
         return csr_array((values[numbers.data - 1], numbers.indices, numbers.indptr), shape=numbers.shape)
 
-    def edges_of(self, path: I64) -> I64:
-        """Return the edges (n - 1,) along a path of nodes (n,). Raises `ManipError` if an edge is missing."""
-        numbers = self.numbers
-        found = np.array([numbers[pair] for pair in pairwise(path.tolist())], np.int64) - 1
-        if (found < 0).any():
-            raise ManipError("no edge joins two consecutive nodes of a path")
-        return found
-
     def sums(self, path: I64) -> F64:
-        """Return the feature sums (K,) over the edges of a path of nodes (n,)."""
-        return self.features[self.edges_of(path)].sum(axis=0)
+        """Return the feature sums (K,) over the edges of a path of nodes (n,). Raises `ManipError` without one."""
+        edges = np.array([self.numbers[pair] for pair in pairwise(path.tolist())], np.int64) - 1
+        if (edges < 0).any():
+            raise ManipError("no edge joins two consecutive nodes of a path")
+        return self.features[edges].sum(axis=0)
 
 
 @dataclass(frozen=True)
 class Plan:
     """The cheapest path to the goal from every node.
 
-    costs: (S,), infinite if no path leads to the goal. following: the next node, (S,), `NOWHERE` at the goal and if
+    costs: (S,), infinite if no path leads to the goal. following: the next node, (S,), negative at the goal and if
     there is no path.
     """
 
@@ -85,7 +79,7 @@ def plan(problem: PathProblem, weights: F64) -> Plan:
 def plan_edges(problem: PathProblem, costs: F64) -> Plan:
     """Return the cheapest path from every node for edge costs (E,), 0 or more: Dijkstra backwards from the goal."""
     found, following = dijkstra(problem.matrix(costs).T.tocsr(), indices=problem.goal, return_predecessors=True)
-    return Plan(found, np.where(following < 0, NOWHERE, following).astype(np.int64))
+    return Plan(found, following)
 
 
 def cheapest_path(problem: PathProblem, planned: Plan, start: int) -> tuple[I64, F64]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Self
 
 import mujoco
@@ -19,8 +20,8 @@ from manip_il.mdp import F64
 from manip_il.option import NameOrPath
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import hand_down
-from manip_il.sim.shape import CUBE, Shape
-from manip_il.sim.task import Limits, Observed, Rung, Start, Target
+from manip_il.sim.shape import CUBE, ObjectShape
+from manip_il.sim.task import Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, Scene, World
 from manip_il.tasks.carry.grid import Descent, descent
 from manip_il.tasks.carry.layout import ABOVE, ASIDE, DEFAULT, FULL, OBSTACLES, TASTES, Layout, Reward
@@ -38,7 +39,7 @@ from manip_il.tasks.carry.obstacles import (
     scale_of,
 )
 from manip_il.tasks.grasp import grasp_of, once_per_state
-from manip_il.tasks.ladder import AT_GOAL, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
+from manip_il.tasks.ladder import AT_GOAL, CLOSED, approach, grasp_progress, grasp_rungs, is_held, nearness
 from manip_il.tasks.pick_place import OBJECT, PickPlace
 from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying, draw_xy, turn_left
 
@@ -59,23 +60,23 @@ _SIDES = ((1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # sides that the edge may be on:
 
 def descent_of(world: World) -> Descent:
     """Return the costs-to-go of a world's episode, as a `Descent` to the goal."""
-    return descent(layout_of(world, OBJECT), reward_in(world), world.scene.robot)
+    return descent(layout_of(world, OBJECT), reward_in(world), world.robot)
 
 
 @once_per_state
 def _look(world: World) -> tuple[float, F64 | None]:
     """Cost-to-go at the object's position, and the point to head for."""
-    return descent_of(world).look(world.pose(OBJECT).position)
+    return descent_of(world).look(world.at(OBJECT))
 
 
 def _at_goal(world: World) -> bool:
-    return math.dist(world.pose(OBJECT).position, world.goal) < AT_GOAL
+    return math.dist(world.at(OBJECT), world.goal) < AT_GOAL
 
 
 def _to_goal(world: World) -> Target:
     """Carry the object down the costs-to-go; stay if there is no path."""
     heading = world.goal if _at_goal(world) else _look(world)[1]
-    at, ee = world.pose(OBJECT).position, world.ee.position
+    at, ee = world.at(OBJECT), world.ee.position
     position = ee + (0.0 if heading is None else heading - at)
     position[2] = max(position[2], world.robot.ee.lowest)
     beside = layout_of(world, OBJECT).room(at[None])[0] < 0  # a turning hand would hit an obstacle
@@ -83,30 +84,19 @@ def _to_goal(world: World) -> Target:
     return Target(position, hand_down(yaw), CLOSED, max_step=STEP)
 
 
-def _safe_height(world: World) -> float:
-    """Height of `ee` over the table at which an open hand clears everything on it [m]."""
-    layout = layout_of(world, OBJECT)
-    tallest = max((layout.scale * OBSTACLES[name].height for name, _ in layout.places), default=0.0)
-    return tallest + ABOVE - min(part.bottom for part in layout.parts[1:]) if tallest else 0.0
-
-
 def _rise(world: World) -> float:
     """Least height of the hand over the grasp [m]; it grows with misalignment until the hand clears every obstacle."""
-    g = grasp_of(world, OBJECT)
-    return min(STEEP * max(0.0, g.off - OVER), max(0.0, _safe_height(world) - g.at[2]))
+    layout, g = layout_of(world, OBJECT), grasp_of(world, OBJECT)
+    if not layout.boxes:
+        return 0.0
+    tallest = max(height for _, _, _, height in layout.boxes)
+    safe = tallest + ABOVE - min(part.bottom for part in layout.parts[1:])  # height at which an open hand clears all
+    return min(STEEP * max(0.0, g.off - OVER), max(0.0, safe - g.at[2]))
 
 
 def _approach(world: World, name: str, hover: float) -> Target:
     """Approach as for any object, but above all obstacles until the hand is over the object."""
     return approach(world, name, hover, _rise(world))
-
-
-def _hand_fits(world: World) -> bool:
-    """Whether the hand is clear of the obstacles when it grasps the object."""
-    layout, g = layout_of(world, OBJECT), grasp_of(world, OBJECT)
-    if layout.room(world.pose(OBJECT).position[None])[0] >= -ASIDE:
-        return True
-    return fits(hand_of(world.scene), np.array(g.at), g.yaw, layout)
 
 
 @dataclass(frozen=True)
@@ -118,19 +108,19 @@ class Carry(PickPlace):
 
     name: str = NAME
     instruction: str = "Carry the cube past what stands on the table to the green goal."
-    limits: Limits = Limits(horizon=200)
+    horizon: int = 200
     argument_bodies = TASTE_BODIES
-    rungs: tuple[Rung, ...] = (
-        Rung("at_goal", lambda w: held(w, OBJECT) and _at_goal(w), _to_goal),
-        Rung("carry", lambda w: held(w, OBJECT), _to_goal),
+    rungs = (
+        Rung("at_goal", lambda w: is_held(w, OBJECT) and _at_goal(w), _to_goal),
+        Rung("carry", lambda w: is_held(w, OBJECT), _to_goal),
         *grasp_rungs(lambda w: OBJECT, approach=_approach),
     )
     scale: float = 1.0
     reward: Reward = TASTES[DEFAULT]
 
-    def with_shape(self, shape: Shape) -> Self:
+    def with_shape(self, shape: ObjectShape) -> Self:
         """Return the task with another object."""
-        return replace(super().with_shape(shape), limits=Limits(horizon=200 if shape == CUBE else 300))
+        return replace(super().with_shape(shape), horizon=200 if shape == CUBE else 300)
 
     def with_argument(self, text: NameOrPath) -> Self:
         """Return the task with the reward that a text or a file describes; its name lists the nonzero weights."""
@@ -157,11 +147,11 @@ class Carry(PickPlace):
                 continue
             fewer = names[: max(1, len(names) - tried // _TOO_MANY)]
             if obstacles := _draw_obstacles(rng, world, fewer, at, goal):
-                weights = np.reshape(self.reward.weights, (-1, 3))
-                tastes = {name: (three, UPRIGHT) for name, three in zip(TASTE_BODIES, weights, strict=True)}
+                weights = zip(TASTE_BODIES, np.reshape(self.reward.weights, (-1, 3)), strict=True)
+                tastes = {name: (three, UPRIGHT) for name, three in weights}
                 return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT), **obstacles, **tastes})
         raise UsageError(
-            f"task {self.name}: none of {_DRAWS:,} layouts drawn fits within reach of {world.scene.robot.name};"
+            f"task {self.name}: none of {_DRAWS:,} layouts drawn fits within reach of {world.robot.name};"
             " choose another task or robot"
         )
 
@@ -171,20 +161,20 @@ class Carry(PickPlace):
 
     def unsound(self, world: World) -> str:
         """Return why there is no sound label (obstacles overlap, no room for the hand, no path to the goal), or ""."""
-        layout, at = layout_of(world, OBJECT), world.pose(OBJECT).position
+        layout, at = layout_of(world, OBJECT), world.at(OBJECT)
         if layout.meeting:
             return "two obstacles overlap"
-        if held(world, OBJECT):
+        if is_held(world, OBJECT):
             leads = _at_goal(world) or _look(world)[1] is not None
-        elif not _hand_fits(world):
-            return "no room for the hand beside an obstacle"
         else:
-            leads = descent_of(world).leads(at)
+            g, leads = grasp_of(world, OBJECT), descent_of(world).leads(at)
+            if layout.room(at[None])[0] < -ASIDE and not fits(hand_of(world.scene), g.at, g.yaw, layout):
+                return "no room for the hand beside an obstacle"
         return "" if leads else "no free path to the goal"
 
     def progress(self, world: World) -> float:
         """Return progress by distance to the grasp, then by cost-to-go divided by the cost of a metre at the goal."""
-        if not held(world, OBJECT):
+        if not is_held(world, OBJECT):
             return 0.9 * _GRASPED * grasp_progress(world, OBJECT, rise=_rise(world))
         if _at_goal(world):
             return 1.0
@@ -196,9 +186,9 @@ class Carry(PickPlace):
 
 def _draw_goal(rng: np.random.Generator, world: World, at: F64) -> F64:
     """Draw a goal, half of the time on the table, (3,) [m]."""
-    x, y = draw_xy(rng, world)
+    xy = draw_xy(rng, world)
     up = rng.uniform(0, HIGHEST * scale_of(world.scene)) if rng.uniform() < IN_AIR else 0.0
-    return np.array([x, y, at[2] + up])
+    return np.append(xy, at[2] + up)
 
 
 def _has_way(world: World, at: F64, goal: F64) -> bool:
@@ -207,8 +197,8 @@ def _has_way(world: World, at: F64, goal: F64) -> bool:
     if math.dist(at[:2], goal[:2]) < APART * scale or not world.reach.has(goal):
         return False
     height = scale * max(one.height for one in OBSTACLES.values()) + max(world.extents(OBJECT)) / 2 + 2 * ABOVE
-    over = [np.array([*one[:2], max(height, goal[2])], np.float64) for one in (at, goal)]
-    lines = [np.linspace(start, end, 12) for start, end in ((at, over[0]), (over[0], over[1]), (over[1], goal))]
+    over = [np.append(place[:2], max(height, goal[2])) for place in (at, goal)]
+    lines = [np.linspace(start, end, 12) for start, end in pairwise((at, *over, goal))]
     return bool(world.reach.has_each(np.concatenate(lines, dtype=np.float64)).all())
 
 
@@ -227,17 +217,16 @@ def _draw_obstacles(
     if edge is not None:
         poses[EDGE] = edge[0], turn_left(math.atan2(edge[1][1], edge[1][0]))
     places: dict[str, F64] = {}
-    for name in (one for one in OBSTACLES if one in here):
+    for name in (name for name in OBSTACLES if name in here):
         nearest = x - scene.robot.workspace.half_width + scale_of(scene) * OBSTACLES[name].half[0]  # towards the robot
         for _ in range(TRIES):
-            place = _draw_place(rng, scene, at, goal)
-            layout = make_layout(scene, lengths, goal, {**places, name: place}, edge)
-            if place[0] > nearest and _leaves_room(layout, hand_of(scene).home, at):
-                places[name], poses[name] = place, (place, UPRIGHT)
+            places[name] = _draw_place(rng, scene, at, goal)
+            layout = make_layout(scene, lengths, goal, places, edge)
+            if places[name][0] > nearest and _leaves_room(layout, hand_of(scene).home, at):
                 break
         else:
             return {}
-    return poses
+    return poses | {name: (place, UPRIGHT) for name, place in places.items()}
 
 
 def _draw_edge(rng: np.random.Generator, scene: Scene, at: F64, goal: F64) -> tuple[F64, F64]:
@@ -252,12 +241,10 @@ def _draw_place(rng: np.random.Generator, scene: Scene, at: F64, goal: F64) -> F
     """Draw a place on the table, mostly between start and goal, (3,) [m]."""
     space, scale = scene.robot.workspace, scale_of(scene)
     if rng.uniform() > BETWEEN:
-        x, y = np.array(space.centre) + rng.uniform(-1.4, 1.4, 2) * space.half_width
-        return np.array([x, y, 0.0])
+        return np.append(np.array(space.centre) + rng.uniform(-1.4, 1.4, 2) * space.half_width, 0.0)
     way, share = (goal - at)[:2], rng.uniform(0.25, 0.75)
     across = np.array([-way[1], way[0]]) / max(np.linalg.norm(way), 1e-9)
-    x, y = at[:2] + share * way + across * rng.normal(0.0, OFF * scale)
-    return np.array([x, y, 0.0])
+    return np.append(at[:2] + share * way + across * rng.normal(0.0, OFF * scale), 0.0)
 
 
 def _leaves_room(layout: Layout, home: F64, at: F64) -> bool:
@@ -265,11 +252,9 @@ def _leaves_room(layout: Layout, home: F64, at: F64) -> bool:
     ends = np.array([at, layout.goal, [*home[:2], max(home[2], layout.half)]])
     if layout.room(ends).min() < SPARE:
         return False
-    *others, (name, place) = [(one, np.array(where)) for one, where in layout.places]
-    half = layout.scale * np.array(OBSTACLES[name].half)
-    for other, where in others:
-        apart = np.abs(place - where) - half - layout.scale * np.array(OBSTACLES[other].half)
-        if apart.max() < GAP * layout.scale:
-            return False
+    *others, (_, place, half, _) = layout.boxes
+    gaps = [(np.abs(place - other) - half - its).max() for _, other, its, _ in others]
+    if min(gaps, default=np.inf) < GAP * layout.scale:
+        return False
     edge = layout.edge
     return edge is None or bool((np.array(edge.at) - place) @ np.array(edge.outwards) > half.max())

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from manip_il.robots.reach import reach_of
 from manip_il.robots.table import get_robot
 from manip_il.tasks.carry.grid import Grid, descent
-from manip_il.tasks.carry.layout import FEATURES, TASTES, Edge, Layout, Part, Reward, path_features
+from manip_il.tasks.carry.layout import FEATURES, TASTES, Edge, Layout, Part, Reward
 from manip_il.tasks.carry.paths import cheapest_path, plan
 
 from ...tables import every_robot
+from .features import path_features
 
 PARTS = (Part(-0.025, 0.036), Part(-0.018, 0.072), Part(0.07, 0.105), Part(0.19, 0.139))
 LAYOUT = Layout(

@@ -9,7 +9,7 @@ from manip_il.collect.expert import Expert
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names
 from manip_il.sim.task import phases
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.carry.layout import OBSTACLES, TASTES, path_features
+from manip_il.tasks.carry.layout import OBSTACLES, TASTES
 from manip_il.tasks.carry.obstacles import EDGE, TASTE_BODIES, is_there, layout_of, observed_layout, reward_in
 from manip_il.tasks.carry.task import OBJECT, descent_of
 from manip_il.tasks.envs import make_env
@@ -18,6 +18,7 @@ from manip_il.tasks.table import TASKS
 
 from ...scenes import SEED, drive_until, started
 from ...tables import every_robot
+from .features import path_features
 
 STARTS = range(SEED, SEED + 6)
 PHASES = phases(TASKS["carry"])
