@@ -150,10 +150,14 @@ def _workspace(model: mujoco.MjModel, hand: str) -> dict[str, Any]:
     length = sum(steps[:-1])
     x, y, _ = places[-1].tolist()
     return {
-        "centre": [round(x + _REACHES * length, 2), round(y, 2) + 0.0],
-        "half_width": round(min(_WIDEST, _HALF * length), 2),
-        "height": round(min(_HIGHEST, 3 * _HALF * length), 2),
+        "centre": [_to_centimetres(x + _REACHES * length), _to_centimetres(y)],
+        "half_width": _to_centimetres(min(_WIDEST, _HALF * length)),
+        "height": _to_centimetres(min(_HIGHEST, 3 * _HALF * length)),
     }
+
+
+def _to_centimetres(length: float) -> float:
+    return round(length / 0.01) / 100
 
 
 def yaml_of(found: Mapping[str, Any], model: str, gripper: str = "") -> str:
