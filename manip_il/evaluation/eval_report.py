@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from manip_il.evaluation.comparison import Study
-from manip_il.evaluation.figures import COLOURS, curve_figures, rates_figure
+from manip_il.evaluation.figures import COLOURS, curve_figures
 from manip_il.evaluation.report import Film, Report, Section
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.side import Side
@@ -50,7 +50,7 @@ def compare_report(study: Study, title: str) -> Report:
     first = sides[0].results[0]
     note = f"Every policy ran {first.success.n:,} test episodes on the same seeds, which selected no policy."
     if len(sides[0].members) > 1:
-        note += " In brackets and in the figure: each training seed."
+        note += " In brackets: each training seed."
     what = first.robot if study.baseline is None else f"{first.robot} {first.task}"
     return run_report(
         sides,
@@ -94,7 +94,7 @@ def run_report(
     if tested.settings.disturbance != "none":
         note = f"{note} Conditions: {tested.settings.disturbance}.".lstrip()
     table = table or success_table(sides)
-    sections = [Section("Results", figures=(rates_figure(sides),), tables=(table,), notes=(note,))]
+    sections = [Section("Results", tables=(table,), notes=(note,))]
     counted = [sum((Counter(result.failures) for result in side.results), Counter[str]()) for side in failed]
     phases = [phase for phase, _ in sum(counted, Counter[str]()).most_common() if phase]
     if phases:

@@ -157,12 +157,15 @@ class EvalResult:
     @property
     def success(self) -> Proportion:
         """Share of episodes that succeeded at some time."""
-        return Proportion.of([episode.success for episode in self.episodes], self.until_width is not None)
+        return self._share("success")
 
     @property
     def success_at_end(self) -> Proportion:
         """Share of episodes that were at the goal when they ended."""
-        return Proportion.of([episode.success_at_end for episode in self.episodes], self.until_width is not None)
+        return self._share("success_at_end")
+
+    def _share(self, outcome: str) -> Proportion:
+        return Proportion.of([getattr(episode, outcome) for episode in self.episodes], self.until_width is not None)
 
     @cached_property
     def by_condition(self) -> dict[str, EvalResult]:

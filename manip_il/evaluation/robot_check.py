@@ -38,7 +38,6 @@ ENOUGH = 0.95  # share of the workspace that a suitable robot reaches
 LOW = 0.03  # height of objects on the table [m]
 _ROOM = 0.13  # margin of the map around the workspace [m]
 _VIEW = (4.4, 3.5)  # size of a picture of the arm [inches]
-_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 
 
 @dataclass(frozen=True)
@@ -62,9 +61,14 @@ class TaskCheck:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        facts = {"done": self.done, "starts": self.starts, "refused": self.refused}
-        tests = {"clean": self.clean, "noisy": self.noisy}
-        return {"task": self.name} | facts | {key: one and one.success.to_json() for key, one in tests.items()}
+        return {
+            "task": self.name,
+            "done": self.done,
+            "starts": self.starts,
+            "refused": self.refused,
+            "clean": self.clean and self.clean.success.to_json(),
+            "noisy": self.noisy and self.noisy.success.to_json(),
+        }
 
 
 @dataclass(frozen=True)
@@ -215,7 +219,8 @@ def _reach_figure(robot: Robot) -> Figure:
         axis = axes[0, 0]
         reached = _reached(robot, wide, 61).astype(float)
         axis.imshow(reached, extent=extent, origin="lower", cmap="Greens", vmin=0, vmax=3, interpolation="nearest")
-        axis.plot(*np.array([(x + a * half, y + b * half) for a, b in _SQUARE]).T, color=INK, lw=1)
+        axis.hlines([y - half, y + half], x - half, x + half, color=INK, lw=1)
+        axis.vlines([x - half, x + half], y - half, y + half, color=INK, lw=1)
         axis.set(xlim=extent[:2], ylim=extent[2:], xlabel="x, away from the base [m]", ylabel="y, to its left [m]")
         axis.grid(visible=False)
         return to_figure(drawn, "Where the hand reaches on the table, from above")
@@ -235,10 +240,11 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
         if task.refused and check.table:  # if no point is within reach, the first line says so
             lines.append(f"{task.name}: {task.refused}.")
         elif task.clean is not None:
-            success, (phase, count) = task.clean.success, next(iter(task.clean.failures.items()))
-            failed = f"the expert fails in {success.n - success.successes} of {success.n} episodes"
-            watch = f"manip-il view --robot.type={check.name} --task.type={task.name}"
-            lines.append(f"{task.name}: {failed}, {count} in phase {phase}; watch it: {watch}")
+            success, phase = task.clean.success, next(iter(task.clean.failures))
+            lines.append(
+                f"{task.name}: the expert fails in {success.n - success.successes} of {success.n} episodes, mostly in "
+                f"phase {phase}; watch it: manip-il view --robot.type={check.name} --task.type={task.name}"
+            )
     return tuple(lines)
 
 

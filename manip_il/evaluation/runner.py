@@ -20,7 +20,7 @@ from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.json_lines import append_line, read_lines
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import MismatchError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.suites import suite_conditions
@@ -197,7 +197,7 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
     """Return seed -> result of the episodes in `folder`. If the episodes' file is missing, write its first line.
 
     The first line identifies policy, environment, versions and settings. Raises `MismatchError` if they differ from
-    those of `job`, `ManipError` for a line that is not an episode.
+    those of `job`.
     """
     path = folder / EPISODES_FILE
     common: dict[str, Any] = {
@@ -205,11 +205,7 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
         "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
         "settings": EvalSettings.of(job, suite).to_json(),
     }
-    try:
-        records = read_lines(path)
-        results = [EpisodeResult.from_json(record) for record in records[1:]]
-    except (KeyError, TypeError, ValueError, ManipError) as error:
-        raise ManipError(f"{path}: a line is not an episode ({error}); start again with --overwrite=true") from error
+    records = read_lines(path)
     if not records:
         append_line(path, common)
         return {}
@@ -217,7 +213,7 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
         if (before := records[0].get(key)) != now:
             what = f"{key} ({folder} was started with another; --overwrite=true starts over)"
             raise MismatchError(what, "the earlier run", before, "this one", now)
-    return {result.seed: result for result in results}
+    return {record["seed"]: EpisodeResult.from_json(record) for record in records[1:]}
 
 
 def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]:
