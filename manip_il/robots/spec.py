@@ -231,8 +231,8 @@ def _remove_scene_elements(spec: mujoco.MjSpec, hand: str = "", kept: str = "") 
 
     hand: if given, all that is not in this body's tree also belongs to the scene: a floor, a table, what lies on it.
     """
-    for one in _scene_elements(spec, hand, kept):
-        spec.delete(one)
+    for element in _scene_elements(spec, hand, kept):
+        spec.delete(element)
     copy_options(PLAIN, spec)
     for name in dir(spec):
         if name.startswith("nuser_"):
@@ -247,10 +247,8 @@ def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
 
 
 def _scene_elements(spec: mujoco.MjSpec, hand: str, kept: str) -> Iterator[Any]:
-    """Yield what to delete; each kind is looked up only at its turn, as MuJoCo deletes dependents, too."""
+    """Yield what to delete; each kind is looked up at its turn, as MuJoCo deletes what depends on a body, too."""
     yield from list(spec.keys)
-    mocaps = {body.name for body in spec.bodies if body.mocap}
-    yield from [equality for equality in spec.equalities if {equality.name1, equality.name2} & mocaps]
     yield from [body for body in spec.bodies if body.mocap]
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     yield from [geom for geom in spec.geoms if geom.type == plane or (hand and geom.parent.name == "world")]
