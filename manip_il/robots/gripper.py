@@ -56,8 +56,8 @@ class Gripper:
         config, self._sweep = robot.gripper, sweep(robot)
         self.q = np.array([model.joint(prefix + name).qposadr[0] for name in config.joints], dtype=np.int64)
         self.ctrl = np.array([model.actuator(prefix + name).id for name in config.joints], dtype=np.int64)
-        self._closed, self._open = np.asarray(config.closed), np.asarray(config.open)
-        self._travel = self._open - self._closed
+        self._closed = np.asarray(config.closed)
+        self._travel = np.subtract(config.open, config.closed)
         weights = 1 / (self._travel * len(self._travel))  # of the joints in how far the gripper is open, 0 to 1
         self._weights = tuple(zip(self.q.tolist(), weights.tolist(), strict=True))
         self._offset = float(weights @ self._closed)

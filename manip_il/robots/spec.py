@@ -97,7 +97,10 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
     _fix_joints(robot, spec, linked)
     if linked:
         _keep_links_apart(spec, robot.hand)
-        _settle(spec, linked)
+    for name in linked:  # a little inertia and damping keep undriven joints from ringing
+        joint = spec.joint(name)
+        joint.armature = max(joint.armature, _LINK_ARMATURE)
+        joint.damping = np.maximum(joint.damping, [_LINK_DAMPING, 0, 0])
     _motorise(robot, spec)
     ee = robot.ee
     frame = {"pos": ee.position, "quat": ee.quaternion}
@@ -293,14 +296,6 @@ def _motorise(robot: Robot, spec: mujoco.MjSpec) -> None:
             joint.range = np.degrees(sorted(ends)) if in_degrees else sorted(ends)
         kp, kv, force = _FINGER_GAINS if slides else _HINGE_GAINS
         _position_actuator(spec, joint, (kp, kv, gripper.force or force))
-
-
-def _settle(spec: mujoco.MjSpec, linked: Sequence[str]) -> None:
-    """Give a linkage's undriven joints a little inertia and damping, which keep them from ringing."""
-    for name in linked:
-        joint = spec.joint(name)
-        joint.armature = max(joint.armature, _LINK_ARMATURE)
-        joint.damping = np.maximum(joint.damping, [_LINK_DAMPING, 0, 0])
 
 
 def _position_actuator(spec: mujoco.MjSpec, joint: Any, gains: tuple[float, float, float]) -> None:
