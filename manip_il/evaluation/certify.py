@@ -13,7 +13,7 @@ here, is a lower bound of u.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -75,8 +75,8 @@ class Row:
     @property
     def gaps(self) -> list[int]:
         """Q*(s, a) - V*(s) of each wrong action [control steps]; the whole horizon if the expert did not recover."""
-        known = [(case.steps, case.undisturbed) for case in self.cases if case.undisturbed is not None]
-        return [self.horizon if steps is None else steps - undisturbed for steps, undisturbed in known]
+        known = [case for case in self.cases if case.undisturbed is not None]
+        return [self.horizon if case.steps is None else case.steps - (case.undisturbed or 0) for case in known]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; a case is [seed, moment, steps, undisturbed]."""
@@ -110,9 +110,8 @@ class Certificate:
 
     def to_json(self) -> dict[str, Any]:
         """Return the contents of `certificate.json`."""
-        content = {"robot": self.robot, "task": self.task, "fingerprint": dict(self.fingerprint)}
-        content |= {"settings": dict(self.settings), "confidence": CONFIDENCE, "mu": self.mu}
-        return content | {"rows": [row.to_json() for row in self.rows]}
+        rows = [row.to_json() for row in self.rows]
+        return vars(self) | {"confidence": CONFIDENCE, "mu": self.mu, "rows": rows}
 
     def table(self) -> Table:
         """Return one row per kind of perturbation: how often the expert recovers, and what a wrong action costs."""
@@ -145,40 +144,41 @@ def certify(
     from that step on, the expert has a whole horizon to solve it. on_episode: called with every episode as it ends.
     """
     seeds = stream_seeds("certificate", cases, seed)
+    rows: list[Row] = []
 
     def rollouts(job: RolloutJob, seeds: Sequence[int] = seeds) -> Iterator[Episode]:
         for episode in engine.run(job, seeds):
             yield episode
             on_episode(episode)
 
-    def row(group: Group, kind: str, words: str, cases: list[Case]) -> Row:
-        in_order = tuple(sorted(cases, key=lambda case: case.seed))
-        return Row(group, kind, words, in_order, env.horizon, len(seeds) - len(cases))
+    def add(group: Group, kind: str, words: str, cases: Iterable[Case]) -> None:
+        in_order = tuple(sorted(cases))
+        rows.append(Row(group, kind, words, in_order, env.horizon, len(seeds) - len(in_order)))
 
     plain = {episode.seed: episode for episode in rollouts(RolloutJob(env, hold=0))}
     starts = [_case(episode, 0, env.horizon) for episode in plain.values()]
+    add("start", "start", "undisturbed, from the start", starts)
     solved = {case.seed: case.steps for case in starts if case.steps is not None}
     if not solved:
         raise ManipError(
             f"the expert solved none of {len(seeds)} undisturbed episodes within {env.horizon} steps, so there is "
             "nothing to perturb; give it a longer --env.horizon"
         )
-    rows = [row("start", "start", "undisturbed, from the start", starts)]
     for kind, known in kinds_for(get_task(env.task)).items():
         moments = {seed: draw_moment(seed, kind, steps) for seed, steps in solved.items()}
         longer = replace(env, horizon=max(moments.values()) + env.horizon)
         job = RolloutJob(longer, hold=0, conditions=(Perturbation(kind, moments),))
-        found: list[Case] = []
-        for episode in rollouts(job, list(moments)):
-            moment = moments[episode.seed]
-            if _differ(episode, plain[episode.seed], moment):
-                found.append(_case(episode, moment, env.horizon, solved[episode.seed] - moment))
-        rows.append(row("action" if known.wrong else "state", kind, known.words, found))
+        found = [
+            _case(episode, moment, env.horizon, solved[episode.seed] - moment)
+            for episode in rollouts(job, list(moments))
+            if _differ(episode, plain[episode.seed], moment := moments[episode.seed])
+        ]
+        add("action" if known.wrong else "state", kind, known.words, found)
     job = RolloutJob(env, hold=0, conditions=(Condition("noise", action_noise=(NOISE, NOISE)),))
-    noisy = [_case(episode, 0, env.horizon) for episode in rollouts(job)]
-    rows.append(row("start", "noise", f"{100 * NOISE:.0f} % noise on every action", noisy))
-    settings = {"cases": cases, "seed": seed}
-    settings |= {name: getattr(env, name) for name in ("horizon", "control_hz", "tolerance", "success_steps")}
+    noisy = (_case(episode, 0, env.horizon) for episode in rollouts(job))
+    add("start", "noise", f"{100 * NOISE:.0f} % noise on every action", noisy)
+    names = ("horizon", "control_hz", "tolerance", "success_steps")
+    settings = {"cases": cases, "seed": seed} | {name: getattr(env, name) for name in names}
     spec = env_spec(env)
     return Certificate(spec.robot, spec.task, env_fingerprint(env), settings, tuple(rows))
 

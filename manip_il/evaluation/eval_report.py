@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from manip_il.evaluation.comparison import Study
-from manip_il.evaluation.figures import COLOURS, curve_figures, rates_figure
+from manip_il.evaluation.figures import COLOURS, curve_figures
 from manip_il.evaluation.report import Film, Report, Section
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.side import Side
@@ -19,7 +19,7 @@ from manip_il.tasks.stock import table as stock
 
 def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = "") -> Report:
     """Return the report of an evaluation. no_films: why there are no films, or empty."""
-    settings, sides = result.settings, condition_sides(result)
+    settings, success = result.settings, result.success
     solved = f"an error of at most {100 * settings.tolerance:g} cm for {settings.success_steps} control steps in a row"
     if result.robot in stock.ROBOTS:
         solved = "as the environment itself reports it"
@@ -27,28 +27,19 @@ def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = 
     note = f"Episodes have at most {settings.horizon:,} control steps. Success: {solved}{end}."
     if result.until_width is not None:
         note += " Intervals are from a confidence sequence, which is valid whenever the evaluation stops."
-    return Report(
+    verdict = f"{result.policy} succeeds in {success} of {success.n:,} unseen episodes of {result.robot} {result.task}"
+    phase, count = next(iter(result.failures.items()), ("", 0))
+    if phase:  # else nothing failed, or the task has no phases
+        verdict += f"; {count:,} of its {success.n - success.successes:,} failures end in the phase {phase}"
+    return run_report(
+        condition_sides(result),
+        films=films,
+        no_films=no_films,
+        note=note,
+        failed=[Side.of("failed episodes", result)],
         title=f"Evaluation of {result.policy}: {result.robot} {result.task}",
-        verdict=evaluation_verdict(result),
-        sections=(
-            _results(sides, success_table(sides), note, result),
-            *_failures([Side.of("failed episodes", result)]),
-            *_films(films, no_films),
-        ),
-        fingerprint=result.fingerprint,
+        verdict=f"{verdict}.",
     )
-
-
-def run_report(
-    sides: Sequence[Side], runs: Sequence[Side], films: Sequence[Film] = (), no_films: str = "", **parts: Any
-) -> Report:
-    """Return the report of a run's policies, one per side.
-
-    runs: whose rounds are drawn as curves. parts: other fields of `Report`, such as the title.
-    """
-    tested = next((side.disturbed for side in sides if side.disturbed), sides[0].results[0])
-    results = _results(sides, success_table(sides), "", tested)
-    return Report(sections=(results, *_curves(runs), *_films(films, no_films)), **parts)
 
 
 def compare_report(study: Study, title: str) -> Report:
@@ -56,21 +47,68 @@ def compare_report(study: Study, title: str) -> Report:
     others = [side.name for side in study.sides if side.name != study.baseline]
     colours = dict(zip(others, itertools.cycle(COLOURS), strict=False))
     sides = [replace(side, colour=colours.get(side.name, BASELINE)) for side in study.sides]
-    table = replace(study.table(), colours=tuple(side.colour for side in sides))
     first = sides[0].results[0]
     note = f"Every policy ran {first.success.n:,} test episodes on the same seeds, which selected no policy."
     if len(sides[0].members) > 1:
-        note += " In brackets and in the figure: each training seed."
-    failures = _failures(sides) if study.baseline is not None else []
-    curves = _curves([side for side in sides if side.histories], study.target)
+        note += " In brackets: each training seed."
     what = first.robot if study.baseline is None else f"{first.robot} {first.task}"
-    return Report(
+    return run_report(
+        sides,
+        [side for side in sides if side.histories],
+        table=replace(study.table(), colours=tuple(side.colour for side in sides)),
+        note=note,
+        failed=[] if study.baseline is None else sides,
+        target=study.target,
         title=f"{title}: {what}",
         verdict=study.verdict,
         facts=tuple(study.facts),
-        sections=(_results(sides, table, note, first), *failures, *curves),
-        fingerprint=first.fingerprint,
     )
+
+
+def run_report(
+    sides: Sequence[Side],
+    runs: Sequence[Side] = (),
+    films: Sequence[Film] = (),
+    no_films: str = "",
+    *,
+    table: Table | None = None,
+    note: str = "",
+    failed: Sequence[Side] = (),
+    target: float | None = None,
+    **parts: Any,
+) -> Report:
+    """Return the report of policies, one per side: success, failures, costs and films.
+
+    Args:
+        sides: Measured sides; the conditions of a disturbed one are named.
+        runs: Sides whose rounds are drawn as curves.
+        films: Films of episodes.
+        no_films: Why there are no films, or empty.
+        table: Table of the results, by default that of `success_table`.
+        note: A paragraph below the table.
+        failed: Sides whose failed episodes are counted by the phase that they ended in.
+        target: Validation success that is marked in the curves, in [0, 1].
+        parts: Other fields of `Report`, such as the title.
+    """
+    tested = next((side.disturbed for side in sides if side.disturbed), sides[0].results[0])
+    if tested.settings.disturbance != "none":
+        note = f"{note} Conditions: {tested.settings.disturbance}.".lstrip()
+    table = table or success_table(sides)
+    sections = [Section("Results", tables=(table,), notes=(note,))]
+    counted = [sum((Counter(result.failures) for result in side.results), Counter[str]()) for side in failed]
+    phases = [phase for phase, _ in sum(counted, Counter[str]()).most_common() if phase]
+    if phases:
+        rows = tuple((phase, *(f"{counts[phase]:,}" for counts in counted)) for phase in phases)
+        failures = Table(("phase that it ended in", *(side.name for side in failed)), rows)
+        sections.append(Section("Where they fail", tables=(failures,)))
+    if runs:
+        words = "Validation success by round of each run. Seconds are of collecting and fitting, without validating."
+        sections.append(Section("Success against cost", figures=curve_figures(runs, target), notes=(words,)))
+    if films or no_films:
+        lead = (f"No films: {no_films}",) if no_films else ()
+        sections.append(Section("How it looks", lead, films=tuple(films)))
+    parts.setdefault("fingerprint", tested.fingerprint)
+    return Report(sections=tuple(sections), **parts)
 
 
 def condition_sides(result: EvalResult) -> list[Side]:
@@ -103,45 +141,3 @@ def success_table(sides: Sequence[Side]) -> Table:
         )
     head = ("", "episodes", "expert labels", f"success {INTERVAL}", "success at end", "steps to success")
     return Table((*head, "success, disturbed"), tuple(rows), tuple(side.colour for side in sides))
-
-
-def evaluation_verdict(result: EvalResult) -> str:
-    """Return the report's first sentence: success with its interval, and the phase in which most failures end."""
-    success = result.success
-    verdict = f"{result.policy} succeeds in {success} of {success.n:,} unseen episodes of {result.robot} {result.task}"
-    phase, count = next(iter(result.failures.items()), ("", 0))
-    if not phase:  # nothing failed, or the task has no phases
-        return f"{verdict}."
-    return f"{verdict}; {count:,} of its {success.n - success.successes:,} failures end in the phase {phase}."
-
-
-def _results(sides: Sequence[Side], table: Table, note: str, tested: EvalResult) -> Section:
-    """Return a section of success rates. tested: an evaluation whose conditions are added to the note."""
-    disturbance = tested.settings.disturbance
-    if disturbance != "none":
-        note = f"{note} Conditions: {disturbance}.".lstrip()
-    return Section("Results", figures=(rates_figure(sides),), tables=(table,), notes=(note,))
-
-
-def _failures(sides: Sequence[Side]) -> list[Section]:
-    """Return a section with the failed episodes of each side by the phase that they ended in; [] if none failed."""
-    counted = [sum((Counter(result.failures) for result in side.results), Counter[str]()) for side in sides]
-    total = sum(counted, Counter[str]()).most_common()
-    rows = [(phase, *(f"{counts[phase]:,}" for counts in counted)) for phase, _ in total if phase]
-    columns = ("phase that it ended in", *(side.name for side in sides))
-    return [Section("Where they fail", tables=(Table(columns, tuple(rows)),))] if rows else []
-
-
-def _curves(sides: Sequence[Side], target: float | None = None) -> list[Section]:
-    """Return a section on success against every cost; [] if there are no runs."""
-    if not sides:
-        return []
-    note = "Validation success by round of each run. Seconds are of collecting and fitting, without validating."
-    return [Section("Success against cost", figures=curve_figures(sides, target), notes=(note,))]
-
-
-def _films(films: Sequence[Film], no_films: str) -> list[Section]:
-    """Return a section with the films, or with the reason if there are none."""
-    if not films and not no_films:
-        return []
-    return [Section("How it looks", (f"No films: {no_films}",) if no_films else (), films=tuple(films))]

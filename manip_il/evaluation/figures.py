@@ -1,4 +1,4 @@
-"""Figures of reports, drawn by matplotlib as SVG: success rates and learning curves.
+"""Figures of reports, drawn by matplotlib as SVG: learning curves.
 
 A panel is as wide as a phone's screen, so that its text stays readable there; wide windows show panels side by side.
 """
@@ -24,7 +24,6 @@ RULE = "#e3e5e8"
 COLOURS = (DAGGER, CLONING, EXPERT, "#a6408a", "#9a6f00", "#2f8fc4", "#7a4a2b")
 _MARKERS = ("o-", "s-", "D-", "^-")  # distinguishable without colour
 _PANEL = (4.4, 3.0)  # size of a figure placed beside others [inches]
-_NAME = 20  # characters per line of a bar's name
 _DPI = 96
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",  # looks the same whatever fonts a machine has
@@ -68,27 +67,6 @@ def to_figure(drawn: Any, words: str) -> Figure:
     return Figure(content.getvalue(), words, round(_DPI * drawn.get_figwidth()))
 
 
-def plain(text: str) -> str:
-    """Return text with matplotlib's maths markup and control characters escaped."""
-    return printable(text).replace("$", r"\$")
-
-
-def rates_figure(sides: Sequence[Side]) -> Figure:
-    """Draw each side's success rates with their intervals, one mark per training seed, from 0 to 100 %."""
-    names = [textwrap.fill(plain(side.name), _NAME) for side in sides]
-    lines = sum(2 + name.count("\n") for name in names)
-    with drawing(1, size=(_PANEL[0], 0.5 + 0.17 * lines)) as (drawn, axes):
-        axis = axes[0, 0]
-        for place, side in enumerate(sides):
-            for number, result in enumerate(side.results):
-                at = place + 0.5 * number / len(side.results)
-                axis.plot([100 * end for end in result.success.interval], [at, at], color=side.colour, lw=3, alpha=0.4)
-                axis.plot(100 * result.success.rate, at, "o", color=side.colour)
-        axis.set_yticks(range(len(sides)), names, color=INK)
-        axis.set(xlim=(-2, 102), xlabel="success [%]", ylim=(len(sides) - 0.3, -0.7))
-        return to_figure(drawn, f"Success rates with intervals: {', '.join(side.name for side in sides)}")
-
-
 def curve_figures(sides: Sequence[Side], target: float | None = None) -> tuple[Figure, ...]:
     """Draw the validation success of each run of the sides against every cost, one figure each.
 
@@ -99,7 +77,7 @@ def curve_figures(sides: Sequence[Side], target: float | None = None) -> tuple[F
         with drawing(1, size=_PANEL) as (drawn, axes):
             axis = axes[0, 0]
             for place, side in enumerate(sides):
-                label = plain(textwrap.shorten(side.name, 40))
+                label = printable(textwrap.shorten(side.name, 40)).replace("$", r"\$")
                 for run in side.histories:
                     rates = [100 * one.validation.rate for one in run]
                     axis.plot([one.amount(cost) for one in run], rates, _MARKERS[place % 4], c=side.colour, label=label)

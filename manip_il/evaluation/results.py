@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path, PurePath
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from manip_il import checks
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
 
 FILE_NAME = "eval.json"
-_MOST = 10**9  # of anything that is counted
 # keys of every episode, in the order of `EpisodeResult`
 _KEYS = {"seed": int, "success": bool, "success_at_end": bool, "steps": int, "return": float, "phase_at_end": str}
 
@@ -59,11 +59,9 @@ class EpisodeResult:
 
         Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or invalid.
         """
-        values: list[Any] = [convert(data[key]) for key, convert in _KEYS.items()]
-        checks.text("condition", data.get("condition", ""))
-        checks.mapping("drawn", data.get("drawn", {}))
-        checks.number("steps_to_success", data.get("steps_to_success") or 0)
-        return cls(*values, detail={key: value for key, value in data.items() if key not in _KEYS})
+        detail = dict(data)
+        values: list[Any] = [convert(detail.pop(key)) for key, convert in _KEYS.items()]
+        return cls(*values, detail=detail)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,18 +83,16 @@ class EvalSettings:
     object: str = ""
 
     def __post_init__(self) -> None:
-        for steps in (self.horizon, self.success_steps, self.control_hz, 0 if self.hold is None else self.hold):
-            checks.whole("horizon, success_steps, control_hz or hold", steps, 0, _MOST)
-        checks.number("tolerance", self.tolerance)
-        checks.text("suite", self.suite)
         checks.object_name(self.object)
 
     @classmethod
     def of(cls, job: RolloutJob, suite: str = NOMINAL.name) -> EvalSettings:
         """Return the settings of a job whose conditions are called `suite`."""
-        env, conditions = job.env, job.conditions or (NOMINAL,)
-        steps, hz = env.success_steps, env.control_hz
-        return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, stored(env.object))
+        env = job.env
+        return cls(
+            *(env.horizon, env.tolerance, env.control_hz, env.success_steps),
+            *(suite, job.conditions or (NOMINAL,), job.hold, stored(env.object)),
+        )
 
     @property
     def disturbance(self) -> str:
@@ -105,15 +101,18 @@ class EvalSettings:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        plain = {field.name: getattr(self, field.name) for field in fields(self)}
+        plain = {name: getattr(self, name) for name in _SETTINGS}
         return plain | {"conditions": [condition.to_json() for condition in self.conditions]}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
         """Return the inverse of `to_json`; raises what `EpisodeResult.from_json` does. Other keys are ignored."""
-        values = {field.name: data[field.name] for field in fields(cls)}
-        values["conditions"] = tuple(Condition(**one) for one in values["conditions"])
+        values: dict[str, Any] = {name: data[name] for name in _SETTINGS}
+        values["conditions"] = tuple(Condition(**ranges) for ranges in data["conditions"])
         return cls(**values)
+
+
+_SETTINGS = tuple(field.name for field in fields(EvalSettings))
 
 
 @dataclass(frozen=True)
@@ -138,10 +137,10 @@ class EvalResult:
     def __post_init__(self) -> None:
         if not self.episodes:
             raise ManipError(f"evaluation of {self.policy}: no episodes")
-        seeds = {episode.seed for episode in self.episodes}
-        if len(seeds) != len(self.episodes):
+        seeds = len({episode.seed for episode in self.episodes})
+        if seeds != len(self.episodes):
             raise ManipError(
-                f"evaluation of {self.policy}: {len(self.episodes)} episodes on {len(seeds)} seeds; "
+                f"evaluation of {self.policy}: {len(self.episodes)} episodes on {seeds} seeds; "
                 "every episode needs its own seed; give each part another --eval.first"
             )
 
@@ -158,12 +157,15 @@ class EvalResult:
     @property
     def success(self) -> Proportion:
         """Share of episodes that succeeded at some time."""
-        return Proportion.of([episode.success for episode in self.episodes], self.until_width is not None)
+        return self._share("success")
 
     @property
     def success_at_end(self) -> Proportion:
         """Share of episodes that were at the goal when they ended."""
-        return Proportion.of([episode.success_at_end for episode in self.episodes], self.until_width is not None)
+        return self._share("success_at_end")
+
+    def _share(self, outcome: str) -> Proportion:
+        return Proportion.of([getattr(episode, outcome) for episode in self.episodes], self.until_width is not None)
 
     @cached_property
     def by_condition(self) -> dict[str, EvalResult]:
@@ -176,9 +178,9 @@ class EvalResult:
     @property
     def steps_to_success(self) -> float | None:
         """Mean control steps until the first success, over successful episodes; None if no episode records it."""
-        steps = [episode.detail.get("steps_to_success") for episode in self.episodes if episode.success]
-        known = [float(count) for count in steps if count is not None]
-        return sum(known) / len(known) if known else None
+        steps = (episode.detail.get("steps_to_success") for episode in self.episodes if episode.success)
+        known = [count for count in steps if count is not None]
+        return fmean(known) if known else None
 
     @property
     def failures(self) -> dict[str, int]:
@@ -188,12 +190,14 @@ class EvalResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the contents of `eval.json`."""
-        anytime = "confidence sequence: holds whenever one stops"
+        method = "Wilson's score interval"
+        if self.until_width is not None:
+            method = "confidence sequence: holds whenever one stops"
         return {
             "success_rate": self.success.rate,
             "interval": list(self.success.interval),
             "confidence": CONFIDENCE,
-            "interval_method": "Wilson's score interval" if self.until_width is None else anytime,
+            "interval_method": method,
             "n_episodes": len(self.episodes),
             "success_at_end_rate": self.success_at_end.rate,
             "until_width": self.until_width,
@@ -213,17 +217,16 @@ class EvalResult:
 
         Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or invalid.
         """
-        width = data["until_width"]
         return cls(
-            policy=checks.text("policy", data["policy"]),
+            policy=data["policy"],
             # Older files store the path of a user's own robot, which is named like its file.
             robot=checks.name("robot", PurePath(checks.text("robot", data["robot"])).stem),
             task=checks.task_name(data["task"]),
-            fingerprint=checks.mapping("fingerprint", data["fingerprint"]),
+            fingerprint=data["fingerprint"],
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),
-            settings=EvalSettings.from_json(checks.mapping("settings", data["settings"])),
-            policy_sha256=checks.text("policy_sha256", data["policy_sha256"]),
-            until_width=None if width is None else checks.number("until_width", width),
+            settings=EvalSettings.from_json(data["settings"]),
+            policy_sha256=data["policy_sha256"],
+            until_width=data["until_width"],
         )
 
     def write(self, path: Path) -> None:
@@ -241,7 +244,7 @@ class EvalResult:
         try:
             return cls.from_json(data)
         except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, ManipError) as error:
-            why = f"key {error} is missing" if isinstance(error, KeyError) else checks.one_line(error)
+            why = "it has no key " * isinstance(error, KeyError) + checks.one_line(error)
             raise ManipError(f"{path}: not an {FILE_NAME}: {why}") from error
 
 
@@ -272,4 +275,4 @@ def require_equal(left: str, one: object, right: str, other: object, *names: str
 def require_comparable(left: str, one: EvalResult, right: str, other: EvalResult, *more: str) -> None:
     """Raise `MismatchError` if two evaluations differ in robot, task, a setting, or an attribute named in `more`."""
     require_equal(left, one, right, other, *more, "robot", "task")
-    require_equal(left, one.settings, right, other.settings, *(field.name for field in fields(EvalSettings)))
+    require_equal(left, one.settings, right, other.settings, *_SETTINGS)

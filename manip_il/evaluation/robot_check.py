@@ -8,6 +8,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
@@ -26,11 +27,9 @@ from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.config import CAMERAS, FILM
 from manip_il.sim.render import framed_picture
-from manip_il.sim.scene import PREFIX
-from manip_il.sim.world import Scene, World
+from manip_il.sim.world import World
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import scene_of
-from manip_il.tasks.table import get_task
 
 FILE_NAME = "check.json"
 SOLVES = 0.9  # share of clean episodes that the expert must solve if a task is to count as possible
@@ -39,7 +38,6 @@ ENOUGH = 0.95  # share of the workspace that a suitable robot reaches
 LOW = 0.03  # height of objects on the table [m]
 _ROOM = 0.13  # margin of the map around the workspace [m]
 _VIEW = (4.4, 3.5)  # size of a picture of the arm [inches]
-_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 
 
 @dataclass(frozen=True)
@@ -63,9 +61,14 @@ class TaskCheck:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        facts = {"done": self.done, "starts": self.starts, "refused": self.refused}
-        tests = {"clean": self.clean, "noisy": self.noisy}
-        return {"task": self.name} | facts | {key: one and one.success.to_json() for key, one in tests.items()}
+        return {
+            "task": self.name,
+            "done": self.done,
+            "starts": self.starts,
+            "refused": self.refused,
+            "clean": self.clean and self.clean.success.to_json(),
+            "noisy": self.noisy and self.noisy.success.to_json(),
+        }
 
 
 @dataclass(frozen=True)
@@ -105,9 +108,17 @@ def check_robot(
     engine: Engine,
     on_result: Callable[[EpisodeResult], object],
 ) -> RobotCheck:
-    """Measure a robot, given by name or YAML, on tasks. episodes: per task without random actions, and as many with.
+    """Measure a robot on tasks.
 
-    on_result: called with every episode's result as it ends. Raises `UsageError` if the robot itself cannot be used.
+    Args:
+        name: The robot's name, or its YAML.
+        tasks: Names of tasks.
+        episodes: Episodes per task without random actions, and as many with.
+        engine: What runs them.
+        on_result: Called with every episode's result as it ends.
+
+    Raises:
+        UsageError: If the robot itself cannot be used.
     """
     robot, scene = get_robot(name), scene_of(name, "reach")
     checked = [check_starts(name, task) for task in tasks]
@@ -119,30 +130,30 @@ def check_robot(
                 seeds = stream_seeds("validation", episodes)
                 found.append(evaluate(engine, job, seeds, "expert", on_result, suite=condition.name))
             checked[place] = replace(task, clean=found[0], noisy=found[1])
-    table = float(np.mean(_reached(robot, robot.workspace.half_width, 41)))
+    table = float(_reached(robot, robot.workspace.half_width, 41).mean())
     return RobotCheck(name, robot, scene.gripper.most, table, tuple(checked))
 
 
 def check_starts(name: NameOrPath, task: str) -> TaskCheck:
     """Draw up to `STARTS` starts of a task with a robot, as episodes do; stop at one without a valid placement."""
-    the_task, starts = get_task(task), 0
+    starts = 0
     try:
         world = World(scene_of(name, task))
         world.update()
         for seed in stream_seeds("validation", STARTS):
-            the_task.draw(rng_for(seed, "reset"), world)
+            world.scene.task.draw(rng_for(seed, "reset"), world)
             starts += 1
     except UsageError as error:
         return TaskCheck(task, starts, str(error))
     return TaskCheck(task, starts)
 
 
-def _reached(robot: Robot, half: float, n: int) -> list[list[bool]]:
-    """Return whether the hand, pointing down, reaches each point of an n x n grid on the table, row by row along x."""
-    reach = reach_of(robot)
+def _reached(robot: Robot, half: float, n: int) -> NDArray[np.bool_]:
+    """Return whether the hand, pointing down, reaches each point of a grid on the table, (n, n), row by row along x."""
+    steps = np.linspace(-half, half, n)
     x, y = robot.workspace.centre
-    steps = np.linspace(-half, half, n).tolist()
-    return [[reach.has((x + dx, y + dy, LOW)) for dx in steps] for dy in steps]
+    points = np.stack(np.meshgrid(x + steps, y + steps, [LOW]), axis=-1)
+    return reach_of(robot).has_each(points.reshape(-1, 3)).reshape(n, n)
 
 
 def check_report(check: RobotCheck) -> Report:
@@ -178,20 +189,25 @@ def check_report(check: RobotCheck) -> Report:
 def verdict(check: RobotCheck) -> str:
     """Return a sentence on which tasks a robot can do."""
     count, cannot = len(check.tasks), ", ".join(task.name for task in check.failed)
-    asked = any(task.clean is not None for task in check.tasks)
-    can, end = ("can do", "") if asked else ("has starts for", "; the expert was not run")
-    words = f"{check.robot.name} {can} {count - len(check.failed)} of {count} tasks{end}"
-    return f"{words}; it cannot do {cannot}." if cannot else f"{words}."
+    can, end = ("has starts for", "; the expert was not run")
+    if any(task.clean for task in check.tasks):
+        can, end = ("can do", "")
+    end += f"; it cannot do {cannot}." if cannot else "."
+    return f"{check.robot.name} {can} {count - len(check.failed)} of {count} tasks{end}"
 
 
 def task_table(check: RobotCheck) -> Table:
     """Return the table of tasks: starts, and the expert's success without and with random actions."""
     columns = ("task", "starts", f"expert {INTERVAL}", "with random actions")
-    rows: list[tuple[str, ...]] = []
-    for task in check.tasks:
-        tests = (str(one.success) if one else "" for one in (task.clean, task.noisy))
-        rows.append((task.name, f"{task.starts} of {STARTS}", *tests))
-    return Table(columns, tuple(rows), tuple(EXPERT if task.done else CLONING for task in check.tasks))
+    rows = tuple(
+        (
+            task.name,
+            f"{task.starts} of {STARTS}",
+            *(str(run.success) if run else "" for run in (task.clean, task.noisy)),
+        )
+        for task in check.tasks
+    )
+    return Table(columns, rows, tuple(EXPERT if task.done else CLONING for task in check.tasks))
 
 
 def _reach_figure(robot: Robot) -> Figure:
@@ -200,9 +216,11 @@ def _reach_figure(robot: Robot) -> Figure:
     wide = half + _ROOM
     extent = (x - wide, x + wide, y - wide, y + wide)
     with drawing(1, size=(3.6, 3.6)) as (drawn, axes):
-        axis, reached = axes[0, 0], np.array(_reached(robot, wide, 61), float)
+        axis = axes[0, 0]
+        reached = _reached(robot, wide, 61).astype(float)
         axis.imshow(reached, extent=extent, origin="lower", cmap="Greens", vmin=0, vmax=3, interpolation="nearest")
-        axis.plot(*np.array([(x + a * half, y + b * half) for a, b in _SQUARE]).T, color=INK, lw=1)
+        axis.hlines([y - half, y + half], x - half, x + half, color=INK, lw=1)
+        axis.vlines([x - half, x + half], y - half, y + half, color=INK, lw=1)
         axis.set(xlim=extent[:2], ylim=extent[2:], xlabel="x, away from the base [m]", ylabel="y, to its left [m]")
         axis.grid(visible=False)
         return to_figure(drawn, "Where the hand reaches on the table, from above")
@@ -210,7 +228,7 @@ def _reach_figure(robot: Robot) -> Figure:
 
 def advice(check: RobotCheck) -> tuple[str, ...]:
     """Return what to change in the robot's YAML: first for the arm, then for each task that it cannot do."""
-    lines, space = _overlaps(scene_of(check.name, "reach")), check.robot.workspace
+    lines, space = list[str](), check.robot.workspace
     if check.table < ENOUGH:
         x, y = space.centre
         lines.append(
@@ -222,32 +240,12 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
         if task.refused and check.table:  # if no point is within reach, the first line says so
             lines.append(f"{task.name}: {task.refused}.")
         elif task.clean is not None:
-            success, (phase, count) = task.clean.success, next(iter(task.clean.failures.items()))
-            failed = f"the expert fails in {success.n - success.successes} of {success.n} episodes"
-            watch = f"manip-il view --robot.type={check.name} --task.type={task.name}"
-            lines.append(f"{task.name}: {failed}, {count} in phase {phase}; watch it: {watch}")
+            success, phase = task.clean.success, next(iter(task.clean.failures))
+            lines.append(
+                f"{task.name}: the expert fails in {success.n - success.successes} of {success.n} episodes, mostly in "
+                f"phase {phase}; watch it: manip-il view --robot.type={check.name} --task.type={task.name}"
+            )
     return tuple(lines)
-
-
-def _overlaps(scene: Scene) -> list[str]:
-    """Name the bodies that overlap at home, with their depth [mm], in a line; no line if there are none."""
-    depths = dict[str, float]()
-    for contact in _at_home(scene).contact:
-        bodies = sorted(scene.model.geom_bodyid[contact.geom])
-        pair = " and ".join(scene.model.body(body).name.removeprefix(PREFIX) for body in bodies)
-        depths[pair] = max(depths.get(pair, 0.0), -1000 * contact.dist)
-    pairs = ", ".join(f"{pair} by {depth:.1f} mm" for pair, depth in depths.items())
-    remedy = "set another home or base, or exclude their contacts in the model (<exclude body1= body2=/>)."
-    return [f"At home parts overlap: {pairs}: {remedy}"] if pairs else []
-
-
-def _at_home(scene: Scene) -> mujoco.MjData:
-    """The physics of a scene with the arm at home and the gripper open."""
-    data, gripper = mujoco.MjData(scene.model), scene.gripper
-    data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = scene.robot.home
-    gripper.put(data, gripper.most)
-    mujoco.mj_forward(scene.model, data)
-    return data
 
 
 def looks(name: NameOrPath) -> Figure:
@@ -256,7 +254,10 @@ def looks(name: NameOrPath) -> Figure:
     Raises `RenderError` without off-screen OpenGL.
     """
     scene = scene_of(name, "reach")
-    data = _at_home(scene)
+    data, gripper = mujoco.MjData(scene.model), scene.gripper
+    data.qpos[scene.arm_q] = scene.robot.home
+    gripper.put(data, gripper.most)
+    mujoco.mj_forward(scene.model, data)
     data.mocap_pos[:, 2] = -9.0  # move goals out of sight
     with drawing(len(CAMERAS), size=_VIEW) as (drawn, axes):
         for axis, camera in zip(axes[0], CAMERAS, strict=True):

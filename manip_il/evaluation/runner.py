@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,7 +20,7 @@ from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.json_lines import append_line, read_lines
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import MismatchError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.suites import suite_conditions
@@ -61,32 +62,40 @@ def evaluate(
     job: RolloutJob,
     seeds: Sequence[int],
     name: str,
-    on_result: Callable[[EpisodeResult], object] | None = None,
+    on_result: Callable[[EpisodeResult], object] = lambda _: None,
     *,
     suite: str = NOMINAL.name,
-    done: Mapping[int, EpisodeResult] | None = None,
+    done: Mapping[int, EpisodeResult] = MappingProxyType({}),
     until_width: float | None = None,
 ) -> EvalResult:
     """Run `job` on every seed, to the horizon unless the job has a `hold`; episodes are in the order of `seeds`.
 
-    suite: name of the job's conditions. done: seed -> result of an earlier run. until_width: stop once the width of the
-    interval is at most this; checked after every `CHECK_EVERY` seeds in order, independently of the workers. on_result:
-    called with every result as its episode ends. A seed that repeatedly kills its worker is skipped with a warning.
+    A seed that repeatedly kills its worker is skipped with a warning.
+
+    Args:
+        engine: What runs the episodes.
+        job: The rollouts.
+        seeds: The episodes' seeds.
+        name: The policy's name.
+        on_result: Called with every result as its episode ends.
+        suite: Name of the job's conditions.
+        done: Seed -> result of an earlier run.
+        until_width: Stop once the width of the interval is at most this; checked after every `CHECK_EVERY` seeds in
+            order, independently of the workers.
     """
     results: dict[int, EpisodeResult] = {}
-    known = done or {}
-    for part in itertools.batched(seeds, len(seeds) or 1 if until_width is None else CHECK_EVERY):
-        results |= {seed: known[seed] for seed in part if seed in known}
-        for episode in engine.run(job, [seed for seed in part if seed not in known]):
+    asked: list[int] = []
+    for part in itertools.batched(seeds, CHECK_EVERY if until_width else max(len(seeds), 1)):
+        asked += part
+        results |= {seed: done[seed] for seed in part if seed in done}
+        for episode in engine.run(job, [seed for seed in part if seed not in done]):
             results[episode.seed] = episode_result(job, episode)
-            if on_result is not None:
-                on_result(results[episode.seed])
+            on_result(results[episode.seed])
         if until_width is not None:
-            low, high = Proportion.of([one.success for one in results.values()], sequential=True).interval
+            low, high = Proportion.of([result.success for result in results.values()], sequential=True).interval
             if high - low <= until_width:
                 break
-    run = [seed for seed in seeds if seed <= max(results, default=-1)] if until_width else seeds
-    if lost := [seed for seed in run if seed not in results]:
+    if lost := [seed for seed in asked if seed not in results]:
         _LOG.warning("left out of the evaluation, as each repeatedly killed its worker: seeds %s", lost)
     spec = env_spec(job.env)
     return EvalResult(
@@ -94,7 +103,7 @@ def evaluate(
         robot=spec.robot,
         task=spec.task,
         fingerprint=env_fingerprint(job.env, observed_cameras(job)),
-        episodes=tuple(results[seed] for seed in seeds if seed in results),
+        episodes=tuple(results[seed] for seed in asked if seed in results),
         settings=EvalSettings.of(job, suite),
         policy_sha256=policy_sha256(job.policy) if job.policy is not None else "",
         until_width=until_width,
@@ -113,11 +122,8 @@ def episode_hold(env: EnvConfig, hold: int | None = HOLD) -> int | None:
 
 def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     """Return the result of an episode."""
-    solved = episode.columns[schema.SUCCESS].ravel()
-    first = int(np.argmax(solved)) + 1 if solved.any() else None
+    solved = np.flatnonzero(episode.columns[schema.SUCCESS])
     states = episode.columns[schema.SIM_STATE]
-    start, end = (positions(job.env, states[row]) for row in (0, -1))
-    drawn = draw(job.conditions, episode.seed, job.env.object)
     phase = int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])
     if phase == 0 and episode.success_at_end:  # the expert is not queried in a solved state
         phase = -1
@@ -129,11 +135,11 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
         ret=float(episode.columns[schema.REWARD].sum()),
         phase_at_end=env_spec(job.env).phases[phase],
         detail={
-            "steps_to_success": first,
+            "steps_to_success": int(solved[0]) + 1 if solved.size else None,
             "condition": turn_of(job.conditions, episode.seed).name,
-            "drawn": drawn,
-            "start": start,
-            "end": end,
+            "drawn": draw(job.conditions, episode.seed, job.env.object),
+            "start": positions(job.env, states[0]),
+            "end": positions(job.env, states[-1]),
         },
     )
 
@@ -150,11 +156,10 @@ def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
         found = stock.positions
     else:
         world = _world(config_scene(env))
-        task = world.scene.task
         world.restore(state.physics, state.variation)
+        first = world.scene.task.objects_in(world)[:1]
         found = {"hand": world.ee.position}
-        for name in world.scene.objects:
-            found["object" if name in task.objects_in(world)[:1] else name] = world.pose(name).position
+        found |= {"object" if name in first else name: world.pose(name).position for name in world.scene.objects}
     return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
 
 
@@ -191,7 +196,7 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
     """Return seed -> result of the episodes in `folder`. If the episodes' file is missing, write its first line.
 
     The first line identifies policy, environment, versions and settings. Raises `MismatchError` if they differ from
-    those of `job`, `ManipError` for a line that is not an episode.
+    those of `job`.
     """
     path = folder / EPISODES_FILE
     common: dict[str, Any] = {
@@ -199,11 +204,7 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
         "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
         "settings": EvalSettings.of(job, suite).to_json(),
     }
-    try:
-        records = read_lines(path)
-        results = [EpisodeResult.from_json(record) for record in records[1:]]
-    except (KeyError, TypeError, ValueError, ManipError) as error:
-        raise ManipError(f"{path}: a line is not an episode ({error}); start again with --overwrite=true") from error
+    records = read_lines(path)
     if not records:
         append_line(path, common)
         return {}
@@ -211,14 +212,13 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
         if (before := records[0].get(key)) != now:
             what = f"{key} ({folder} was started with another; --overwrite=true starts over)"
             raise MismatchError(what, "the earlier run", before, "this one", now)
-    return {result.seed: result for result in results}
+    return {record["seed"]: EpisodeResult.from_json(record) for record in records[1:]}
 
 
 def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]:
     """Return the differences between two runs of one episode. Raises `MismatchError` if their conditions differ."""
     was, now = before.to_json(), after.to_json()
-    drawn = was.get("drawn", {})
-    if drawn != now["drawn"]:
+    if (drawn := was.get("drawn", {})) != now["drawn"]:
         raise MismatchError("what is drawn for the episode", "the file", drawn, "the replay", now["drawn"])
     compared = ("success", "success_at_end", "steps", "return")
     return [f"{name} was {was[name]}, is {now[name]}" for name in compared if was[name] != now[name]]

@@ -144,11 +144,7 @@ def read_member(path: Path) -> Member:
         return Member(path, history=history(records, str(path)))
     if path.is_file() or (path / FILE_NAME).is_file():
         return Member(path, result=EvalResult.read(path))
-    try:
-        return Member(path, policy=find_policy(path))
-    except UsageError:
-        expected = "an eval.json, a policy, a run of manip-il dagger, or a folder of seed_0, seed_1, ... of these"
-        raise UsageError(f"{path} holds nothing to compare; expected {expected}") from None
+    return Member(path, policy=find_policy(path))
 
 
 def require_pair(left: Side, right: Side) -> None:

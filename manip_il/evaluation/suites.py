@@ -29,12 +29,12 @@ def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Conditi
     (`sees`). Limits the objects' sizes to those that the task allows. Raises `UnknownName` for an unknown suite,
     `UsageError` for an invalid file or if no condition is left.
     """
-    asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
-    left = [one for condition in asked if (one := _for_task(condition, env, sees=sees)) is not None]
+    asked = (_for_task(read_condition(name), env, sees=sees) for name in SUITES.get(suite, (suite,)))
+    left = tuple(condition for condition in asked if condition is not None)
     if not left:
         blind = "" if sees else " and a policy without cameras"
         raise UsageError(f"--suite={suite} changes nothing for {env.task}{blind}; choose another suite")
-    return tuple(left)
+    return left
 
 
 def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:

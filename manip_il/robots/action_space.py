@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ class ServoUnits:
 
     def back(self, arm: F64, percent: float) -> tuple[F64, float]:
         """Return joints (n - 1,) [rad] and opening [m] for degrees (n - 1,) and gripper position, 0 to 100."""
-        order = slice(None, None, 1 if self.percents[0] < self.percents[-1] else -1)  # rising, as `interp` needs them
+        order = np.argsort(self.percents)  # rising, as `interp` needs them
         return np.radians(arm), float(np.interp(percent, self.percents[order], self.openings[order]))
 
 
@@ -48,34 +48,25 @@ class ActionSpace:
     scale: F64
     relative: NDArray[np.bool_]
     units: ServoUnits | None = None
+    arm: ClassVar[slice] = slice(-1)  # places of the joints in an action
+    gripper: ClassVar[int] = -1  # place of the gripper's opening
 
     def __len__(self) -> int:
         return len(self.names)
 
-    @cached_property
-    def arm(self) -> NDArray[np.intp]:
-        """Indices of the arm's joints, (n - 1,)."""
-        return np.flatnonzero(self.relative)
-
-    @cached_property
-    def gripper(self) -> int:
-        """Index of the gripper's opening in an action."""
-        return int(np.flatnonzero(~self.relative)[0])
-
     def join(self, arm: F64, opening: float) -> F64:
         """Return the action, or measured state, (n,) for joint values (n - 1,) [rad] and an opening [m]."""
-        return self._together(arm, opening) if self.units is None else self._together(*self.units.of(arm, opening))
+        if self.units is not None:
+            arm, opening = self.units.of(arm, opening)
+        action = np.empty(len(self.names))
+        action[self.arm] = arm
+        action[self.gripper] = opening
+        return action
 
     def split(self, action: F64) -> tuple[F64, float]:
         """Return joint values (n - 1,) [rad] and opening [m] of an action (n,)."""
         arm, gripper = action[self.arm], action[self.gripper]
         return (arm, gripper) if self.units is None else self.units.back(arm, gripper)
-
-    def _together(self, arm: F64, gripper: float) -> F64:
-        action = np.empty(len(self.names))
-        action[self.arm] = arm
-        action[self.gripper] = gripper
-        return action
 
     def clip(self, action: NDArray[np.floating], step: int) -> F64:
         """Clip `action` (n,) to the bounds. Raises `MismatchError` for a wrong shape, `NotFiniteError` for NaN."""
@@ -88,6 +79,7 @@ class ActionSpace:
 
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
         """Draw an action (n,): joint targets within `scale` of the measured `state` (n,), and any gripper opening."""
-        drawn = rng.uniform(-1, 1, len(self.arm)) * self.scale[self.arm]
-        gripper = rng.uniform(self.low[self.gripper], self.high[self.gripper])
-        return self._together(np.asarray(state, dtype=np.float64)[self.arm] + drawn, gripper)
+        action = np.array(state, dtype=np.float64)
+        action[self.arm] += rng.uniform(-1, 1, len(action) - 1) * self.scale[self.arm]
+        action[self.gripper] = rng.uniform(self.low[self.gripper], self.high[self.gripper])
+        return action

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import multiprocessing
-import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -17,7 +16,6 @@ import mujoco
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 
-_INCLUDE = re.compile(rb"<(?:include|model)\s[^>]*?\bfile\s*=\s*[\"']([^\"']+)")
 FRAGMENT = ": it is a fragment; expected the model that includes it"
 KEYS = ("model", "includes", "meshes", "mend")  # keys of `ModelFiles` in a YAML
 
@@ -51,14 +49,13 @@ class ModelFiles:
             model = self._mended(checks.read_bytes(self.model, "an MJCF"))
             home = self.includes or self.model.parent
             name = str(home / f"mended {self.model.name}")
-            included = _included(model, home)  # read here first, because MuJoCo would wait for a pipe
             spec = mujoco.MjSpec.from_file(name, include={name: model})
             if self.meshes is not None:
-                # MuJoCo prefixes names in an included file with its folder
-                meshes = [mesh.file.removeprefix(spec.modelfiledir) for mesh in spec.meshes if mesh.file]
-                assets = {mesh: checks.read_bytes(self.meshes / mesh, "a mesh") for mesh in sorted(meshes)}
-                spec = mujoco.MjSpec.from_string(model.decode(), include=included, assets=assets)
-                spec.meshdir = ""
+                for mesh in spec.meshes:  # MuJoCo prefixes names in an included file with its folder
+                    mesh.file = mesh.file.removeprefix(spec.modelfiledir)
+                names = sorted({mesh.file for mesh in spec.meshes if mesh.file})
+                spec.assets = {mesh: checks.read_bytes(self.meshes / mesh, "a mesh") for mesh in names}
+                spec.meshdir = spec.modelfiledir = ""
             if not spec.joints:
                 raise ManipError(f"{self.model} has no joints{FRAGMENT}")
         except (ManipError, ValueError) as error:
@@ -78,18 +75,6 @@ class ModelFiles:
                 )
             text = text.replace(old, new)
         return text.encode()
-
-
-def _included(model: bytes, home: Path) -> dict[str, bytes]:
-    """Return the files that a model includes or attaches, directly or not, by their paths in it."""
-    found: dict[str, bytes] = {}
-    waiting = [model]
-    while waiting:
-        for name in map(bytes.decode, _INCLUDE.findall(waiting.pop())):
-            if name not in found and (home / name).exists():  # MuJoCo names a missing one
-                found[name] = checks.read_bytes(home / name, "an MJCF")
-                waiting.append(found[name])
-    return found
 
 
 @cache

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from manip_il.errors import UsageError
 from manip_il.mdp import F64
 from manip_il.robots.geometry import Body, at_tip, nearest, outline
-from manip_il.robots.gripper import finger_geoms
+from manip_il.robots.gripper import finger_geoms, set_time_step
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import EndEffector, Robot
 from manip_il.robots.rotations import hand_down, rotation_vector
@@ -23,7 +23,7 @@ FORCE = 200.0  # torque limit of an arm joint whose model sets none [N m]
 ARMATURE = 0.1  # armature of an arm joint whose model has none [kg m^2]
 FREQUENCY = 2 * math.pi * 6.0  # natural frequency of a joint with its motor as a spring [rad/s]
 _AT_OBJECT = 0.7  # share of the way from closed to open at which `ee` is found: about as open as around an object
-_SETTLE, _STEP = 1000, 0.002  # physics steps, and their length [s]
+_SETTLE = 1000  # physics steps
 FROM_TIP = 0.012  # distance of the frame `ee` from the fingertips [m]
 _CLEAR = 0.006  # clearance of the fingertips over the table with `ee` at its lowest [m]
 _SQUARE = 0.95  # cosine of the largest angle from a body axis at which the fingers' motion counts as parallel to it
@@ -40,14 +40,14 @@ _ENOUGH = (0.5, 0.15, 0.25)  # sufficient margin to a limit [rad], smallest sing
 _DIGITS = 4  # decimals of a posture [rad]
 
 
-def complete(said: Mapping[str, Any]) -> Robot:
+def complete(said: dict[str, Any]) -> Robot:
     """Complete a YAML's fields from the robot's model; return the robot. Raises `UsageError` for a field not found."""
-    files, names = said["files"], said["joints"]
-    spec = bare_spec(said["name"], files, said["hand"], said["gripper"])
-    require(said["name"], "joint", names, spec.joints)
-    joints = [spec.joint(name) for name in names]
-    whole = files.load(said["name"])  # keep a reference: MuJoCo's views of a spec do not keep it alive
-    motors = {one.target: one for one in whole.actuators}
+    name, names = said["name"], said["joints"]
+    spec = bare_spec(name, said["files"], said["hand"], said["gripper"])
+    require(name, "joint", names, spec.joints)
+    joints = [spec.joint(joint) for joint in names]
+    whole = said["files"].load(name)  # keep a reference: MuJoCo's views of a spec do not keep it alive
+    motors = {motor.target: motor for motor in whole.actuators}
     found: dict[str, Any] = {
         "forces": tuple(_greatest_torque(motors.get(joint.name), joint) for joint in joints),
         "armature": tuple(float(joint.armature) or ARMATURE for joint in joints),
@@ -56,7 +56,7 @@ def complete(said: Mapping[str, Any]) -> Robot:
         "home": (0.0,) * len(joints),
         "gains": (1.0,) * len(joints),
     }
-    robot = Robot(**{**found, **said})
+    robot = Robot(**found | said)
     if "ee" not in said:
         robot = replace(robot, ee=find_ee(robot))
     if "home" not in said:
@@ -64,16 +64,14 @@ def complete(said: Mapping[str, Any]) -> Robot:
     return robot if "gains" in said else replace(robot, gains=find_gains(robot))
 
 
-def _greatest_torque(motor: mujoco._specs.MjsActuator | None, joint: mujoco._specs.MjsJoint) -> float:
-    limits = [tuple(joint.actfrcrange)]
+def _greatest_torque(motor: Any, joint: Any) -> float:
+    limits = [joint.actfrcrange]
     if motor is not None:
         gear = abs(float(motor.gear[0])) or 1.0
-        limits.append(tuple(gear * float(end) for end in motor.forcerange))
+        limits.append(gear * motor.forcerange)
         if motor.biastype == mujoco.mjtBias.mjBIAS_NONE and motor.gaintype == mujoco.mjtGain.mjGAIN_FIXED:
-            gain = gear * abs(float(motor.gainprm[0]))
-            limits.append(tuple(gain * float(end) for end in motor.ctrlrange))
-    greatest = [min(-low, high) for low, high in limits if low < 0 < high]
-    return float(min(greatest, default=FORCE))
+            limits.append(gear * abs(float(motor.gainprm[0])) * motor.ctrlrange)
+    return float(min((min(-low, high) for low, high in limits if low < 0 < high), default=FORCE))
 
 
 def find_gains(robot: Robot) -> tuple[float, ...]:
@@ -96,37 +94,36 @@ def find_ee(robot: Robot) -> EndEffector:
     the fingers do not come apart.
     """
     model, data = _settled(robot, _AT_OBJECT)
-    hand = model.body(robot.hand).id
-    origin, axes = data.xpos[hand], data.xmat[hand].reshape(3, 3)
+    hand = data.body(robot.hand)
+    axes = hand.xmat.reshape(3, 3)
     fingers = finger_geoms(model, robot.gripper.fingers)
     middle = np.mean([data.geom_xpos[geom] for finger in fingers for geom in finger], axis=0)
-    z = _along_axis(axes.T @ (middle - origin))
-    points = {geom: (outline(model, data, geom) - origin) @ axes for finger in fingers for geom in finger}
-    tip = max(float((points[geom] @ z).max()) for geom in points)
+    z = _along_axis(axes.T @ (middle - hand.xpos))
+    points = _finger_points(robot, model, data)
     pads, ends = nearest(model, data, [at_tip(model, data, finger, axes @ z) for finger in fingers])
-    one, other = (ends - origin) @ axes
+    one, other = (ends - hand.xpos) @ axes
     way = other - one - z * (z @ (other - one))
     if np.linalg.norm(way) < _LEAST_GAP:
         raise UsageError(f"robot {robot.name}: the fingers do not open; check gripper.fingers and gripper.open")
     y = _along_axis(way / np.linalg.norm(way), _SQUARE)
     x = np.cross(y, z)
     low, high = (max((points[pad] @ x).min() for pad in pads), min((points[pad] @ x).max() for pad in pads))
+    tip, closed_tip = (
+        max(float((around @ z).max()) for around in found.values())
+        for found in (points, _finger_points(robot, *_settled(robot, 0.0)))
+    )
     position = x * (low + high) / 2 + y * (y @ (one + other)) / 2 + z * (tip - FROM_TIP)
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, np.stack([x, y, z], axis=1).ravel())
-    return EndEffector(
-        robot.hand,
-        _rounded(position, _METRES),
-        _rounded(quaternion, _TURN),
-        round(FROM_TIP + max(0.0, _tip(robot, z) - tip) + _CLEAR, _METRES),
-    )
+    lowest = round(FROM_TIP + max(0.0, closed_tip - tip) + _CLEAR, _METRES)
+    return EndEffector(robot.hand, _rounded(position, _METRES), _rounded(quaternion, _TURN), lowest)
 
 
 def _settled(robot: Robot, share: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """Compile the robot and let its fingers settle at a share of the way from closed to open; the arm stays still."""
     alone = replace(robot, joints=(), home=(), gains=(), forces=(), armature=(), lerobot=None)
     spec = arm_spec(alone)
-    spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    set_time_step(spec)
     model = spec.compile()
     data, config = mujoco.MjData(model), robot.gripper
     for name, closed, opened in zip(config.joints, config.closed, config.open, strict=True):
@@ -136,13 +133,11 @@ def _settled(robot: Robot, share: float) -> tuple[mujoco.MjModel, mujoco.MjData]
     return model, data
 
 
-def _tip(robot: Robot, z: F64) -> float:
-    """Measure how far the closed fingers extend from the hand [m] along `z` (3,), a direction in its frame."""
-    model, data = _settled(robot, 0.0)
-    hand = model.body(robot.hand).id
-    along = data.xmat[hand].reshape(3, 3) @ z
-    geoms = [geom for finger in finger_geoms(model, robot.gripper.fingers) for geom in finger]
-    return max(float(((outline(model, data, geom) - data.xpos[hand]) @ along).max()) for geom in geoms)
+def _finger_points(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData) -> dict[int, F64]:
+    """Points around every geom of the fingers, by its id, in the hand's frame, (n, 3) [m]."""
+    hand = data.body(robot.hand)
+    geoms = itertools.chain(*finger_geoms(model, robot.gripper.fingers))
+    return {geom: (outline(model, data, geom) - hand.xpos) @ hand.xmat.reshape(3, 3) for geom in geoms}
 
 
 def _along_axis(vector: F64, least: float = 0.0) -> F64:
@@ -162,17 +157,17 @@ def find_home(robot: Robot, turns: bool) -> Robot:
     inverse kinematics converges from none of forty random postures.
     """
     halves = (robot, replace(robot, ee=_half_turned(robot.ee))) if turns else (robot,)
-    heights = [min(_HIGHEST, robot.workspace.height / 2) * share for share in _LOWER]
-    found = (max((_best(one, height) for one in halves), key=lambda one: one[0]) for height in heights)
-    best = next((one for one in found if math.isfinite(one[0])), None)
-    if best is None:
-        x, y = robot.workspace.centre
-        mount = " gripper.quaternion (how the gripper is mounted)," if robot.gripper.files else ""
-        raise UsageError(
-            f"robot {robot.name}: the hand cannot point down over the workspace's centre ({x:g}, {y:g});"
-            f" check workspace.centre,{mount} hand and base, or set home{_stance(robot)}"
-        )
-    return best[1]
+    highest = min(_HIGHEST, robot.workspace.height / 2)
+    for share in _LOWER:
+        worth, found = max((_best(half, highest * share) for half in halves), key=lambda rated: rated[0])
+        if math.isfinite(worth):
+            return found
+    x, y = robot.workspace.centre
+    mount = " gripper.quaternion (how the gripper is mounted)," if robot.gripper.files else ""
+    raise UsageError(
+        f"robot {robot.name}: the hand cannot point down over the workspace's centre ({x:g}, {y:g});"
+        f" check workspace.centre,{mount} hand and base, or set home{_stance(robot)}"
+    )
 
 
 def _stance(robot: Robot) -> str:
@@ -199,32 +194,35 @@ def _rounded(values: F64, digits: int) -> Any:
 
 def _best(robot: Robot, height: float) -> tuple[float, Robot]:
     """The best posture's rating, minus infinity if there is none, and the robot with that posture as `home`."""
-    soft = robot.leans
-    middle = replace(robot, home=tuple(_counted(ArmIK(robot).limits).mean(axis=1)))
+    middle = replace(robot, home=tuple(_search_limits(ArmIK(robot)).mean(axis=1)))
     ik, body = ArmIK(middle), Body(middle)
-    limits = _counted(ik.limits)
+    limits = _search_limits(ik)
     rng = np.random.default_rng(0)
     best = -math.inf, robot
     target = np.array([*robot.workspace.centre, height])
     rotation = hand_down(ik.ahead(target))
     for _ in range(_STARTS):
-        q, miss = _descend(ik, rng.uniform(*limits.T), target, rotation, soft)
+        q, miss = _descend(ik, rng.uniform(*limits.T), target, rotation, robot.leans)
         if miss < _ARRIVED:
-            worth = _worth(ik, q, limits) - len(body.meeting(q))
+            margin = float(np.minimum(q - limits[:, 0], limits[:, 1] - q).min())
+            parts = (margin, ik.smallest_singular_value(q), ik.lowest_link(q))
+            worth = sum(min(1.0, part / enough) for part, enough in zip(parts, _ENOUGH, strict=True))
+            worth -= len(body.meeting(q))
             if worth > best[0]:
                 best = worth, replace(robot, home=_rounded(q, _DIGITS))
     return best
 
 
-def _counted(limits: F64) -> F64:
+def _search_limits(ik: ArmIK) -> F64:
     """Limits of joints, (arm, 2) [rad]; -pi and pi for a joint without limits or with a range of a turn or more."""
-    free = ~np.isfinite(limits).all(axis=1) | (limits[:, 1] - limits[:, 0] >= 2 * np.pi - 1e-3)
-    return np.where(free[:, None], np.array([-np.pi, np.pi]), limits)
+    low, high = ik.limits.T
+    free = ~(high - low < 2 * np.pi - 1e-3)
+    return np.where(free[:, None], [-np.pi, np.pi], ik.limits)
 
 
 def _descend(ik: ArmIK, q: F64, target: F64, rotation: F64, soft: bool) -> tuple[F64, float]:
     """Joints that inverse kinematics reaches from `q`, and the pose error left [m]."""
-    counted, miss = _counted(ik.limits), math.inf
+    miss = math.inf
     for _ in range(_STEPS):
         position, turned = ik.ee_pose(q)
         off = rotation_vector(rotation @ turned.T)
@@ -234,14 +232,6 @@ def _descend(ik: ArmIK, q: F64, target: F64, rotation: F64, soft: bool) -> tuple
         if dq is None or np.abs(dq).max() < 1e-4:
             break
         q = q + dq
-    free = counted[:, 0] == -np.pi
+    free = _search_limits(ik)[:, 0] == -np.pi
     q = np.where(free, (q + np.pi) % (2 * np.pi) - np.pi, q)
     return np.clip(q, *ik.limits.T), miss
-
-
-def _worth(ik: ArmIK, q: F64, limits: F64) -> float:
-    """Rate a posture by its margin to the limits, distance from a singular posture, and height of the links."""
-    margin = float(np.minimum(q - limits[:, 0], limits[:, 1] - q).min())
-    singular = ik.smallest_singular_value(q)
-    parts = (margin, singular, ik.lowest_link(q))
-    return sum(min(1.0, part / enough) for part, enough in zip(parts, _ENOUGH, strict=True))

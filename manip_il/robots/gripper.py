@@ -7,7 +7,7 @@ the gap between the fingers is measured once they rest. Parallel, hinged and lin
 from __future__ import annotations
 
 import bisect
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -56,8 +56,8 @@ class Gripper:
         config, self._sweep = robot.gripper, sweep(robot)
         self.q = np.array([model.joint(prefix + name).qposadr[0] for name in config.joints], dtype=np.int64)
         self.ctrl = np.array([model.actuator(prefix + name).id for name in config.joints], dtype=np.int64)
-        self._closed, self._open = np.asarray(config.closed), np.asarray(config.open)
-        self._travel = self._open - self._closed
+        self._closed = np.asarray(config.closed)
+        self._travel = np.subtract(config.open, config.closed)
         weights = 1 / (self._travel * len(self._travel))  # of the joints in how far the gripper is open, 0 to 1
         self._weights = tuple(zip(self.q.tolist(), weights.tolist(), strict=True))
         self._offset = float(weights @ self._closed)
@@ -126,46 +126,64 @@ def sweep(robot: Robot) -> Sweep:
 
     Raises `UsageError` if they do not come apart.
     """
-    model, data, fingers, shares, poses = _at_rest(robot)
+    spec = arm_spec(robot)
+    set_time_step(spec)
+    model = spec.compile()
+    data, config = mujoco.MjData(model), robot.gripper
+    for name, value in zip(robot.joints, robot.home, strict=True):
+        data.joint(name).qpos[0] = data.actuator(name).ctrl[0] = value
+    fingers = finger_geoms(model, config.fingers)
+    shares, poses = _shares_at_rest(robot, model, data)
 
     def gaps_at(pose: F64, groups: Geoms) -> list[F64]:
         """For each group, the distances [m] from its geoms to the nearest geom of another group."""
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
-        others = [[geom for other in groups if other is not one for geom in other] for one in groups]
         return [
-            np.array([min((distance(model, data, one, other) for other in rest), default=0.0) for one in own])
-            for own, rest in zip(groups, others, strict=True)
+            np.array(
+                [
+                    min(distance(model, data, geom, far) for other in groups if other is not own for far in other)
+                    for geom in own
+                ]
+            )
+            for own in groups
         ]
 
     # Geoms that touch no other finger when open: this leaves out those around a jaw's hinge.
     jaws = [
-        [geom for geom, gap in zip(*one, strict=True) if gap > 0]
-        for one in zip(fingers, gaps_at(poses[-1], fingers), strict=True)
+        [geom for geom, gap in zip(*finger, strict=True) if gap > 0]
+        for finger in zip(fingers, gaps_at(poses[-1], fingers), strict=True)
     ]
     if not all(jaws):
         raise UsageError(f"robot {robot.name}: the fingers touch when open; check gripper.open and gripper.fingers")
     # Of these, the geoms near the tips; the links behind them may pass beside the other finger's.
-    tips = [at_tip(model, data, jaw, data.site("ee").xmat.reshape(3, 3)[:, 2]) for jaw in jaws]
+    hand = data.site("ee")
+    tips = [at_tip(model, data, jaw, hand.xmat.reshape(3, 3)[:, 2]) for jaw in jaws]
     gaps = [gaps_at(pose, tips) for pose in poses]
-    least = [min(float(gap.min()) for gap in one) for one in gaps]
-    shut = max((place for place, gap in enumerate(least) if gap <= 0), default=0)  # last pose with touching tips
-    pads = [_near(gap, tip, float(gap.min())) for gap, tip in zip(gaps[shut], tips, strict=True)]
-    openings = []
-    middles = []
-    shares = shares[shut:]
-    wide = poses[shut:]
-    for pose in wide:
-        openings.append(min(float(one.min()) for one in gaps_at(pose, pads)))
-        middle = nearest(model, data, pads)[1].mean(axis=0) - data.site("ee").xpos
-        middles.append(float(data.site("ee").xmat.reshape(3, 3)[:, 1] @ middle))
-    linked = _linked(robot, model, wide)
-    _check_growth(robot, openings, shares, linked)
+    touching = [place for place, groups in enumerate(gaps) if min(gap.min() for gap in groups) <= 0]
+    shut = max(touching, default=0)
+    least = [gap.min() for gap in gaps[shut]]
+    pads = list(map(_near, gaps[shut], tips, least))
+    shares, poses = shares[shut:], poses[shut:]
+    openings, middles = list[float](), list[float]()
+    for pose in poses:
+        openings.append(float(min(gap.min() for gap in gaps_at(pose, pads))))
+        middle = nearest(model, data, pads)[1].mean(axis=0) - hand.xpos
+        middles.append(float(hand.xmat.reshape(3, 3)[:, 1] @ middle))
+    driven = {*robot.joints, *config.joints}
+    others = [joint for joint in map(model.joint, range(model.njnt)) if joint.name not in driven]
+    linked = {joint.name: np.array([pose[joint.qposadr[0]] for pose in poses]) for joint in others}
+    growth = np.minimum(np.diff(openings), np.diff(shares))
+    if openings[-1] - openings[0] < _LEAST_TRAVEL or growth.min() <= 0:
+        raise UsageError(
+            f"robot {robot.name}: the fingers stand {openings[0]:.4f} m apart when closed, {openings[-1]:.4f} m when "
+            f"open; expected the gap to grow all the way: check gripper.joints (undriven: "
+            f"{', '.join(linked) or 'none'}), closed, open and fingers"
+        )
     holding = jaws  # a turning jaw holds wide objects farther from its tip
     if np.ptp(middles) < _LOPSIDED:
         middles = [0.0] * len(middles)
-        most = [float(gap.min()) for gap in gaps[shut]]
-        holding = [_near(*one) for one in zip(gaps_at(poses[shut], jaws), jaws, most, strict=True)]
+        holding = list(map(_near, gaps_at(poses[0], jaws), jaws, least))
     places = [
         tuple(tuple(map(finger.index, own)) for finger, own in zip(fingers, some, strict=True))
         for some in (pads, holding)
@@ -173,48 +191,25 @@ def sweep(robot: Robot) -> Sweep:
     return Sweep(np.array(shares), np.array(openings), np.array(middles), *places, linked=linked)
 
 
-def _check_growth(robot: Robot, openings: Sequence[float], shares: Sequence[float], linked: Iterable[str]) -> None:
-    """Raise `UsageError` unless the gap grows with every command. linked: names of the undriven joints."""
-    growth = np.minimum(np.diff(openings), np.diff(shares))
-    if openings[-1] - openings[0] >= _LEAST_TRAVEL and growth.min() > 0:
-        return
-    config, place = robot.gripper, int((growth <= 0).argmax())  # the first step without growth
-    start, end = np.interp(shares[place : place + 2], [0, 1], [config.closed[0], config.open[0]])
-    raise UsageError(
-        f"robot {robot.name}: the fingers stand {openings[0]:.4f} m apart when closed, {openings[-1]:.4f} m when open, "
-        f"and go from {openings[place]:.4f} to {openings[place + 1]:.4f} m as {config.joints[0]} goes from {start:.3f} "
-        f"to {end:.3f}; expected the gap to grow all the way: check gripper.joints (undriven: "
-        f"{', '.join(linked) or 'none'}), closed, open and fingers"
-    )
-
-
-def _linked(robot: Robot, model: mujoco.MjModel, poses: Sequence[F64]) -> dict[str, F64]:
-    """The positions of the joints that nothing drives, by name, in every pose."""
-    driven = {*robot.joints, *robot.gripper.joints}
-    others = [joint for joint in map(model.joint, range(model.njnt)) if joint.name not in driven]
-    return {joint.name: np.array([pose[joint.qposadr[0]] for pose in poses]) for joint in others}
-
-
-def _at_rest(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData, Geoms, list[float], list[F64]]:
-    """The model, its data, each finger's geoms, and for each command the share of the way reached and `qpos`."""
-    spec = arm_spec(robot)
+def set_time_step(spec: mujoco.MjSpec) -> None:
+    """Give a gripper that is simulated alone a time step and an integrator that stiff linkages bear."""
     spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    model = spec.compile()
-    data, config = mujoco.MjData(model), robot.gripper
-    for name, value in zip(robot.joints, robot.home, strict=True):
-        data.joint(name).qpos[0] = data.actuator(name).ctrl[0] = value
+
+
+def _shares_at_rest(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData) -> tuple[list[float], list[F64]]:
+    """For each command from closed to open, the share of the way that is reached, and `qpos`."""
+    config = robot.gripper
     q = np.array([model.joint(name).qposadr[0] for name in config.joints])
     ctrl = np.array([model.actuator(name).id for name in config.joints])
-    fingers = finger_geoms(model, config.fingers)
     closed, travel = np.asarray(config.closed), np.subtract(config.open, config.closed)
     data.qpos[q] = closed
-    shares, poses = [], []
+    shares, poses = list[float](), list[F64]()
     for share in np.linspace(0, 1, _COMMANDS):
         data.ctrl[ctrl] = closed + share * travel
         mujoco.mj_step(model, data, _SETTLE)
         shares.append(float(((data.qpos[q] - closed) / travel).mean()))
         poses.append(data.qpos.copy())
-    return model, data, fingers, shares, poses
+    return shares, poses
 
 
 def _near(gaps: F64, geoms: Sequence[int], least: float) -> list[int]:
@@ -228,16 +223,14 @@ def finger_geoms(model: mujoco.MjModel, fingers: Sequence[str], prefix: str = ""
     A descendant that is another finger is left out. prefix: prefix of the bodies' names. Raises `UsageError` for a
     finger without such a geom.
     """
-    roots = {model.body(prefix + name).id: place for place, name in enumerate(fingers)}
-    owners, touching = dict(roots), (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    owners = {model.body(prefix + name).id: place for place, name in enumerate(fingers)}
     for body in range(1, model.nbody):
-        if body not in owners and int(model.body_parentid[body]) in owners:
-            owners[body] = owners[int(model.body_parentid[body])]
-    found = [
-        tuple(i for i in range(model.ngeom) if owners.get(int(model.geom_bodyid[i])) == place and touching[i])
-        for place in range(len(fingers))
-    ]
-    for name, geoms in zip(fingers, found, strict=True):
-        if not geoms:
-            raise UsageError(f"finger {name!r} has no geom with contacts; expected at least one")
-    return found
+        owners.setdefault(body, owners.get(int(model.body_parentid[body]), -1))
+    found: list[list[int]] = [[] for _ in fingers]
+    for geom, body in enumerate(model.geom_bodyid.tolist()):
+        if owners.get(body, -1) >= 0 and (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+            found[owners[body]].append(geom)
+    if not all(found):
+        name = fingers[found.index([])]
+        raise UsageError(f"finger {name!r} has no geom with contacts; expected at least one")
+    return list(map(tuple, found))

@@ -29,8 +29,23 @@ _LARGEST = 0.5  # largest step of a joint in `moved` [rad]
 class PoseProgram:
     """mink's quadratic program that moves a site to a pose and the joints towards `home`, within their limits.
 
-    Stateless: a solution depends only on the posture in `data`, after `update`, and on `home` (n,) [rad]. costs: of the
-    rotation error [1/rad], relative to 1 [1/m] for the position error, and of a joint's distance from `home` [1/rad].
+    With the twist e (6,) from the target to the site, its Jacobian J (6, n) and the costs W of its
+    entries, the joint displacement dq (n,) minimises
+
+        |W (J dq + e)|^2 + c^2 |q + dq - home|^2 + (d + m |W e|^2) |dq|^2
+
+    subject to g (low - q) <= dq <= g (high - q). c is the posture's cost, g mink's gain of joint limits,
+    d = 1e-5, m = 1e-3: the damping grows with the error, so that a singular or distant target gives a
+    short step (Sugihara 2011, IEEE Trans. Robotics 27, 984-991).
+
+    Stateless: a solution depends only on the posture in `data`, after `update`, and on `home`.
+
+    Args:
+        model: The compiled arm.
+        site: Name of the site that is moved.
+        home: Joint positions, (n,) [rad].
+        costs: Cost of the rotation error [1/rad], relative to 1 [1/m] for the position error, and of a
+            joint's distance from `home` [1/rad].
     """
 
     def __init__(self, model: mujoco.MjModel, site: str, home: F64, costs: tuple[float, float]):
@@ -121,9 +136,15 @@ class ArmIK:
     def step(self, position: F64, rotation: F64, largest: float, lean: float = 0.0) -> tuple[F64, float] | None:
         """Return one step towards a pose of `ee`, from the posture of the `ee_pose` call that must precede each step.
 
-        largest: longest joint step [rad]. lean: from 0 to 1, how far the hand may lean from the rotation to reach the
-        position. Returns the joint displacement [rad] (arm,), scaled down as a whole if one joint exceeds `largest`,
-        and the share of the weighted pose error that remains; None if the quadratic program has no solution.
+        Args:
+            position: Target of `ee` in the world, (3,) [m].
+            rotation: Its target rotation, (3, 3).
+            largest: Longest step of a joint [rad].
+            lean: From 0 to 1, how far the hand may lean from the rotation to reach the position.
+
+        Returns:
+            The joint displacement, (arm,) [rad], scaled down as a whole if one joint exceeds `largest`, and
+            the share of the weighted pose error that remains; None if the program has no solution.
         """
         costs = self._costs
         weight = costs.orientation + lean * (costs.leaning - costs.orientation)
@@ -140,9 +161,14 @@ class ArmIK:
     def moved(self, q: F64, motions: F64) -> F64:
         """Return joints (B, arm) [rad], within their limits and near `q` (B, arm), that move `ee` by `motions`.
 
-        motions: translations [m] and rotation vectors [rad] of `ee` in the world's axes, (B, 6). The first step
-        is `displacement`, which resolves redundancy (the elbow of an arm with seven joints) as for the expert; the
-        corrections after it are damped least-squares steps. A pose out of reach is only approached.
+        The first step is `displacement`, which resolves redundancy (the elbow of an arm with seven joints)
+        as for the expert. The corrections after it are damped least-squares steps,
+        dq = J^T (J J^T + 1e-8 I)^-1 e (Nakamura and Hanafusa 1986, J. Dyn. Sys. Meas. Control 108, 163-171).
+        A pose out of reach is only approached.
+
+        Args:
+            q: Measured joints, (B, arm) [rad].
+            motions: Translations [m] and rotation vectors [rad] of `ee` in the world's axes, (B, 6).
         """
         return np.array([self._moved(*row) for row in zip(q, motions, strict=True)]).reshape(q.shape)
 

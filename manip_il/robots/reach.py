@@ -185,7 +185,10 @@ def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
     down, miss = hand_down(yaw), np.inf
     for _ in range(_STEPS):
         ee, rotation = ik.ee_pose(q)
-        miss = float(np.linalg.norm(position - ee) + _ANGLE * _angle_off(robot, rotation, yaw, down))
+        angle = angle_between(down, rotation)
+        if robot.leans:  # such an arm may lean by `_MOST_LEAN`
+            angle = off_yaw(rotation, yaw) + max(0.0, angle_off_vertical(rotation) - _MOST_LEAN)
+        miss = float(np.linalg.norm(position - ee) + _ANGLE * angle)
         if miss < _NEAR:
             break
         dq = ik.displacement(position, down, robot.max_joint_step)
@@ -193,10 +196,3 @@ def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
             break
         q = np.minimum(np.maximum(q + dq, low), high)
     return miss, q
-
-
-def _angle_off(robot: Robot, hand: F64, yaw: float, down: F64) -> float:
-    """Return how far a hand (3, 3) is from `down` at a yaw [rad]; a leaning arm may lean by `_MOST_LEAN`."""
-    if robot.leans:
-        return off_yaw(hand, yaw) + max(0.0, angle_off_vertical(hand) - _MOST_LEAN)
-    return angle_between(down, hand)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fnmatch
 import itertools
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -12,6 +11,7 @@ import mujoco
 import numpy as np
 
 from manip_il.errors import UnknownName, UsageError
+from manip_il.mdp import F64
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.robot import GRIPPER, GripperConfig, Robot
 
@@ -30,46 +30,20 @@ _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def load(files: ModelFiles, robot: str) -> mujoco.MjSpec:
-    """Read a model, with angles in radians and without compiler options that would affect the whole scene.
+    """Read a model, without compiler options that would affect the whole scene.
 
     robot: its name. Raises `UsageError` if MuJoCo cannot read the model.
     """
     spec = files.load(robot)
-    _to_radians(spec)
-    _turn_inertias(spec)
     for name in _OF_A_SCENE:
         setattr(spec.compiler, name, getattr(PLAIN.compiler, name))
     return spec
 
 
-def _to_radians(spec: mujoco.MjSpec) -> None:
-    """Convert every angle from degrees. Each element has the unit of its own file, as a model may attach others."""
-    kinds = ("joints", "bodies", "geoms", "sites", "cameras", "frames")
-    joints, *turned = ([one for one in getattr(spec, kind) if one.compiler.degree] for kind in kinds)
-    for joint in joints:
-        if joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL):
-            joint.range = np.radians(joint.range)
-        if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
-            joint.ref, joint.springref = math.radians(joint.ref), math.radians(joint.springref)
-    for alt in (*(one.alt for kind in turned for one in kind), *(body.ialt for body in turned[0])):
-        alt.euler = np.radians(alt.euler)
-        alt.axisangle = [*alt.axisangle[:3], math.radians(alt.axisangle[3])]
-    for one in itertools.chain(joints, *turned):
-        one.compiler.degree = False
-
-
-def _turn_inertias(spec: mujoco.MjSpec) -> None:
-    """Replace inertia tensors of a URDF by principal moments, as MuJoCo does but without their origin's rotation.
-
-    Its reader gives `iquat`, the axes with that rotation, which its compiler replaces by the tensor's own axes.
-    """
-    for body in spec.bodies:
-        tensor = np.array(body.fullinertia)  # xx, yy, zz, xy, xz, yz
-        if np.isnan(tensor).any() or tuple(body.iquat) == (1, 0, 0, 0):  # no tensor, or one of an MJCF
-            continue
-        moments = np.zeros(3)
-        mujoco.mju_eig3(moments, np.zeros(9), np.zeros(4), tensor[[0, 3, 4, 3, 1, 5, 4, 5, 2]])
-        body.inertia, body.fullinertia = moments, np.full(6, np.nan)
+def joint_range(joint: Any) -> F64:
+    """Return a joint's range (2,) [rad or m], whatever the unit of the file that it comes from."""
+    in_degrees = joint.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
+    return np.radians(joint.range) if in_degrees else np.array(joint.range)
 
 
 def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:
@@ -83,11 +57,11 @@ def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, 
     if camera:
         require(robot, "camera", (camera,), spec.cameras)
         spec.camera(camera).name = WRIST
-    _strip(spec, hand, WRIST if camera else "")
+    _remove_scene_elements(spec, hand, WRIST if camera else "")
     if gripper.files is None:
         return spec
     hand_spec = load(gripper.files, robot)
-    _strip(hand_spec)
+    _remove_scene_elements(hand_spec)
     copy_options(spec, hand_spec)
     mount = spec.body(hand).add_frame(pos=gripper.position, quat=gripper.quaternion)
     spec.attach(hand_spec, prefix=GRIPPER, frame=mount)
@@ -123,7 +97,10 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
     _fix_joints(robot, spec, linked)
     if linked:
         _keep_links_apart(spec, robot.hand)
-        _calm(spec, linked)
+    for name in linked:  # a little inertia and damping keep undriven joints from ringing
+        joint = spec.joint(name)
+        joint.armature = max(joint.armature, _LINK_ARMATURE)
+        joint.damping = np.maximum(joint.damping, [_LINK_DAMPING, 0, 0])
     _motorise(robot, spec)
     ee = robot.ee
     frame = {"pos": ee.position, "quat": ee.quaternion}
@@ -213,13 +190,15 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
     if robot.fixed:
         _place_bodies(spec, robot.fixed)
     for equality in list(spec.equalities):
-        coupled = _coupled(spec, equality)
+        coupled = {equality.name1, equality.name2} - {""}
+        if equality.type != mujoco.mjtEq.mjEQ_JOINT:
+            continue
         if equality.active and not coupled.isdisjoint(robot.joints):
             raise UsageError(
-                f"robot {robot.name}: equality {equality.name or '(unnamed)'} couples {', '.join(sorted(coupled))};"
-                " expected arm joints that move independently (those left out of joints are fixed)"
+                f"robot {robot.name}: an equality couples {', '.join(sorted(coupled))}; expected"
+                " arm joints that move independently (those left out of joints are fixed)"
             )
-        if equality.type == mujoco.mjtEq.mjEQ_JOINT and not coupled <= kept:
+        if not coupled <= kept:
             spec.delete(equality)
     for joint in loose:
         spec.delete(joint)
@@ -228,22 +207,6 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
         while root.parent.name != "world":
             root = root.parent
         root.pos = np.array(robot.base)
-
-
-def _coupled(spec: mujoco.MjSpec, equality: mujoco._specs.MjsEquality) -> set[str]:
-    """The names of the joints that an equality of joints names, or that move one of its bodies against the other."""
-    ends = equality.name1, equality.name2
-    if equality.type == mujoco.mjtEq.mjEQ_JOINT:
-        return set(filter(None, ends))
-    one, other = (_joints_below(spec.body(name)) for name in ends)
-    return one ^ other
-
-
-def _joints_below(body: Any) -> set[str]:
-    """The names of the joints between the world and a body."""
-    if body is None or body.name == "world":
-        return set()
-    return {joint.name for joint in body.joints} | _joints_below(body.parent)
 
 
 def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
@@ -266,29 +229,29 @@ def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
         body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
-def _strip(spec: mujoco.MjSpec, hand: str = "", kept: str = "") -> None:
+def _remove_scene_elements(spec: mujoco.MjSpec, hand: str = "", kept: str = "") -> None:
     """Delete what belongs to a scene: motors, mocap bodies, sky, cameras, gravity and time step.
 
     hand: if given, all that is not in this body's tree also belongs to the scene: a floor, a table, what lies on it.
     """
-    for one in _foreign(spec, hand, kept):
-        spec.delete(one)
-    copy_options(mujoco.MjSpec(), spec)
-    for name in [name for name in dir(spec) if name.startswith("nuser_")]:
-        setattr(spec, name, -1)
+    for element in _scene_elements(spec, hand, kept):
+        spec.delete(element)
+    copy_options(PLAIN, spec)
+    for name in dir(spec):
+        if name.startswith("nuser_"):
+            setattr(spec, name, -1)
 
 
 def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
     """Copy physics options from one spec to another: MuJoCo warns if two specs that it joins have different ones."""
-    for name in [name for name in dir(origin.option) if not name.startswith("_")]:
-        setattr(spec.option, name, getattr(origin.option, name))
+    for name in dir(origin.option):
+        if not name.startswith("_"):
+            setattr(spec.option, name, getattr(origin.option, name))
 
 
-def _foreign(spec: mujoco.MjSpec, hand: str, kept: str) -> Iterator[Any]:
-    """Yield what to delete; each kind is looked up only at its turn, as MuJoCo deletes dependents, too."""
+def _scene_elements(spec: mujoco.MjSpec, hand: str, kept: str) -> Iterator[Any]:
+    """Yield what to delete; each kind is looked up at its turn, as MuJoCo deletes what depends on a body, too."""
     yield from list(spec.keys)
-    mocaps = {body.name for body in spec.bodies if body.mocap}
-    yield from [equality for equality in spec.equalities if {equality.name1, equality.name2} & mocaps]
     yield from [body for body in spec.bodies if body.mocap]
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     yield from [geom for geom in spec.geoms if geom.type == plane or (hand and geom.parent.name == "world")]
@@ -321,26 +284,18 @@ def _motorise(robot: Robot, spec: mujoco.MjSpec) -> None:
         joint.armature = armature
         joint.frictionloss = 0.0  # a servo's own controller overcomes friction
         _position_actuator(spec, joint, (kp, kp * _KV_PER_KP, force))
-    for name, ends in zip(
-        robot.gripper.joints, zip(robot.gripper.closed, robot.gripper.open, strict=True), strict=True
-    ):
+    gripper = robot.gripper
+    for name, *ends in zip(gripper.joints, gripper.closed, gripper.open, strict=True):
         joint = spec.joint(name)
-        if joint.range[0] >= joint.range[1]:  # a linkage that runs past its end folds over
-            joint.range = sorted(ends)
         slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
         joint.damping = np.array([_FINGER_DAMPING if slides else _HINGE_DAMPING, 0, 0])
         joint.armature = _FINGER_ARMATURE if slides else _HINGE_ARMATURE
         joint.frictionloss = 0.0
+        if joint.range[0] >= joint.range[1]:  # a linkage that runs past its end folds over
+            in_degrees = joint.compiler.degree and not slides
+            joint.range = np.degrees(sorted(ends)) if in_degrees else sorted(ends)
         kp, kv, force = _FINGER_GAINS if slides else _HINGE_GAINS
-        _position_actuator(spec, joint, (kp, kv, robot.gripper.force or force))
-
-
-def _calm(spec: mujoco.MjSpec, linked: Sequence[str]) -> None:
-    """Give a linkage's undriven joints a little inertia and damping, which keep them from ringing."""
-    for name in linked:
-        joint = spec.joint(name)
-        joint.armature = max(joint.armature, _LINK_ARMATURE)
-        joint.damping = np.maximum(joint.damping, [_LINK_DAMPING, 0, 0])
+        _position_actuator(spec, joint, (kp, kv, gripper.force or force))
 
 
 def _position_actuator(spec: mujoco.MjSpec, joint: Any, gains: tuple[float, float, float]) -> None:
@@ -350,4 +305,4 @@ def _position_actuator(spec: mujoco.MjSpec, joint: Any, gains: tuple[float, floa
     actuator.set_to_position(kp=kp, kv=kv)
     actuator.forcelimited, actuator.forcerange = True, [-force, force]
     if joint.range[0] < joint.range[1]:
-        actuator.ctrllimited, actuator.ctrlrange = True, joint.range
+        actuator.ctrllimited, actuator.ctrlrange = True, joint_range(joint)

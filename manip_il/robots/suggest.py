@@ -3,38 +3,40 @@
 from __future__ import annotations
 
 import itertools
-import math
-import re
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
-import yaml
 
+from manip_il.checks import one_line
 from manip_il.errors import UsageError
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import nearest
 from manip_il.robots.gripper import finger_geoms
-from manip_il.robots.spec import load
+from manip_il.robots.spec import joint_range, load
 
 _ARM_GOES_ON = 3  # a branch with this many joints in series belongs to the arm: a finger has fewer
 _JAWS = ("jaw", "finger", "grip", "claw")  # words in the name of a single jaw's body or joint
 _HANDS = ("hand", "flange", "attachment", "tool", "gripper", "ee", "tcp")  # words in the name of a gripper's mount
 _REACHES, _HALF = 0.5, 0.18  # distance of the workspace's centre from the base, and its half width, in arm lengths
 _WIDEST, _HIGHEST = 0.15, 0.45  # largest half width and height of a workspace [m]
-_ROUND = 0.01  # what lengths are rounded to [m]
-_FIRST_LINE = (
-    "# A first draft, derived from the model. Review it: manip-il view --robot.type=THIS_FILE (docs/robots.md)"
-)
-_NOTES = {
-    "hand": "body that carries the gripper",
-    "joints": "joints that drive the fingers",
-    "closed": "their positions when closed, [m] if they slide, [rad] if they turn",
-    "fingers": "bodies that touch objects",
-    "centre": "on the table, x away from the base [m]",
-}
+_YAML = """\
+# A first draft, derived from the model. Review it: manip-il view --robot.type=THIS_FILE (docs/robots.md)
+model: {model}
+hand: {hand} # body that carries the gripper
+gripper:{own}
+  joints: {joints} # joints that drive the fingers
+  closed: {closed} # their positions when closed, [m] if they slide, [rad] if they turn
+  open: {open}
+  fingers: {fingers} # bodies that touch objects
+workspace:
+  centre: {centre} # on the table, x away from the base [m]
+  half_width: {half_width}
+  height: {height}
+"""
 
 
 def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
@@ -42,29 +44,16 @@ def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
 
     Raises `UsageError` if MuJoCo cannot read or compile them, or if no hand or no fingers are found.
     """
-    files = [ModelFiles(path.absolute()) for path in (model, gripper) if path is not None]
-    spec, with_jaws = load(files[0], model.stem), load(files[-1], model.stem)
-    palm, jaws = _palm(with_jaws, gripper or model)
-    hand, driven = palm if gripper is None else _flange(spec.worldbody), _driven(with_jaws, jaws, gripper or model)
+    last = gripper or model
+    spec, with_jaws = (load(ModelFiles(path.absolute()), model.stem) for path in (model, last))
+    palm, jaws = _palm(with_jaws, last)
+    hand = palm if gripper is None else _flange(spec.worldbody)
+    driven = _driven(with_jaws, jaws, last)
     try:
-        closed, opened, fingers = _ends(with_jaws, palm, jaws, driven)
-        length, base = _length(spec, hand.name)
+        fingers = _ends(with_jaws, palm, jaws, driven)
+        return {"hand": hand.name, "gripper": fingers, "workspace": _workspace(spec.compile(), hand.name)}
     except ValueError as error:
-        raise UsageError(f"MuJoCo cannot compile {gripper or model}: {' '.join(str(error).split())}") from None
-    return {
-        "hand": hand.name,
-        "gripper": {
-            "joints": [joint.name for joint in driven],
-            "closed": closed,
-            "open": opened,
-            "fingers": list(fingers),
-        },
-        "workspace": {
-            "centre": [_rounded(base[0] + _REACHES * length), _rounded(base[1])],
-            "half_width": _rounded(min(_WIDEST, _HALF * length)),
-            "height": _rounded(min(_HIGHEST, 3 * _HALF * length)),
-        },
-    }
+        raise UsageError(f"MuJoCo cannot compile {last}: {one_line(error)}") from None
 
 
 def _depth(body: Any) -> int:
@@ -75,11 +64,8 @@ def _depth(body: Any) -> int:
 def _palm(spec: mujoco.MjSpec, path: Path) -> tuple[Any, list[Any]]:
     """The body at which the chain of joints branches into fingers, and the first body of each; one jaw is enough."""
     body = spec.worldbody
-    while True:
-        moving = [child for child in body.bodies if _depth(child)]
-        longest = max(moving, key=_depth, default=None)
-        if longest is None:
-            break
+    while moving := [child for child in body.bodies if _depth(child)]:
+        longest = max(moving, key=_depth)
         if len(moving) > 1 and _depth(longest) < _ARM_GOES_ON:
             return body, moving
         body = longest
@@ -93,19 +79,15 @@ def _palm(spec: mujoco.MjSpec, path: Path) -> tuple[Any, list[Any]]:
 
 def _flange(body: Any) -> Any:
     """The body that a gripper is mounted on: the last of the chain, or one fixed to it with a name in `_HANDS`."""
-    while True:
-        moving = [child for child in body.bodies if _depth(child)]
-        if not moving:
-            break
+    while moving := [child for child in body.bodies if _depth(child)]:
         body = max(moving, key=_depth)
-    named = [one for one in body.find_all("body") if any(word in one.name.lower() for word in _HANDS)]
+    named = [part for part in body.find_all("body") if any(word in part.name.lower() for word in _HANDS)]
     return named[-1] if named else body
 
 
 def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
     """The finger joints to drive: those that slide, else those with motors, else those next to the hand."""
-    joints = [joint for jaw in jaws for joint in (*jaw.joints, *(one for one in jaw.find_all("joint")))]
-    joints = list({joint.name: joint for joint in joints}.values())
+    joints = [joint for jaw in jaws for joint in jaw.find_all("joint")]
     slides = [joint for joint in joints if joint.type == mujoco.mjtJoint.mjJNT_SLIDE]
     motors = {motor.target for motor in spec.actuators}
     motored = [joint for joint in joints if joint.name in motors]
@@ -121,17 +103,12 @@ def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
     return driven
 
 
-def _ends(
-    spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[Any]
-) -> tuple[list[float], list[float], Sequence[str]]:
+def _ends(spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[Any]) -> dict[str, Any]:
     """Find each driven joint's closed and open positions, by the fingers' distance, and the bodies that touch."""
-    moving = [
-        jaw.name
-        for jaw in jaws
-        if {joint.name for joint in (*jaw.joints, *jaw.find_all("joint"))} & {j.name for j in driven}
-    ]
+    names = {joint.name for joint in driven}
+    moving = [jaw.name for jaw in jaws if not names.isdisjoint(joint.name for joint in jaw.find_all("joint"))]
     bodies = moving if len(moving) > 1 else [palm.name, *moving]
-    ranges = [tuple(float(end) for end in joint.range) for joint in driven]
+    ranges = [tuple(joint_range(joint).tolist()) for joint in driven]
     model = spec.compile()
     data, fingers = mujoco.MjData(model), finger_geoms(model, bodies)
     opposed = [[one, *(other for other in fingers if other is not one)] for one in fingers]
@@ -146,40 +123,45 @@ def _ends(
         return float(apart + np.linalg.norm(centres - centres.mean(axis=0), axis=1).sum())
 
     middle = [sum(ends) / 2 for ends in ranges]
-    opened, closed = list(middle), list(middle)
+    closed, opened = list[float](), list[float]()
     for place, ends in enumerate(ranges):
-        gaps = [gap([*middle[:place], end, *middle[place + 1 :]]) for end in ends]
-        opened[place], closed[place] = ends if gaps[0] > gaps[1] else ends[::-1]
+        before, after = middle[:place], middle[place + 1 :]
+        near, far = sorted(ends, key=lambda end, before=before, after=after: gap([*before, end, *after]))
+        closed.append(near)
+        opened.append(far)
     gap(closed)
-    pads = nearest(model, data, fingers)[0]
-    touching = [model.body(model.geom_bodyid[pad]).name for pad in pads]
-    closed, opened = ([float(f"{one:.5g}") + 0.0 for one in ends] for ends in (closed, opened))  # no -0
-    return closed, opened, touching if len(moving) > 1 else bodies
+    if len(moving) > 1:
+        bodies = [model.body(model.geom_bodyid[pad]).name for pad in nearest(model, data, fingers)[0]]
+    closed, opened = ([float(f"{end:.5g}") + 0.0 for end in ends] for ends in (closed, opened))  # no -0
+    return {"joints": [joint.name for joint in driven], "closed": closed, "open": opened, "fingers": bodies}
 
 
-def _length(spec: mujoco.MjSpec, hand: str) -> tuple[float, tuple[float, float]]:
-    """Length of the arm from its second joint to the hand [m], and where its base stands, x and y [m]."""
-    model = spec.compile()
+def _workspace(model: mujoco.MjModel, hand: str) -> dict[str, Any]:
+    """Propose a workspace, given the arm's length from its second joint to the hand and where its base is."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    body, places = model.body(hand).id, [data.xpos[model.body(hand).id]]
+    body = model.body(hand).id
+    places = [data.xpos[body]]
     while body:
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        places += [data.xanchor[joint] for joint in range(first, first + count)]
+        first = int(model.body_jntadr[body])
+        places += list(data.xanchor[first : first + int(model.body_jntnum[body])])
         body = int(model.body_parentid[body])
     steps = [float(np.linalg.norm(a - b)) for a, b in itertools.pairwise(places)]
-    return sum(steps[:-1]), (float(places[-1][0]), float(places[-1][1]))
+    length = sum(steps[:-1])
+    x, y, _ = places[-1].tolist()
+    return {
+        "centre": [_to_centimetres(x + _REACHES * length), _to_centimetres(y)],
+        "half_width": _to_centimetres(min(_WIDEST, _HALF * length)),
+        "height": _to_centimetres(min(_HIGHEST, 3 * _HALF * length)),
+    }
 
 
-def _rounded(length: float) -> float:
-    return round(round(length / _ROUND) * _ROUND, 3)
+def _to_centimetres(length: float) -> float:
+    return round(length / 0.01) / 100
 
 
 def yaml_of(found: Mapping[str, Any], model: str, gripper: str = "") -> str:
     """Return what `suggest` found as YAML text, with comments. model, gripper: their paths, as written to the YAML."""
-    own = {"model": gripper} if gripper else {}
-    tree = {"model": model, **found, "gripper": own | found["gripper"]}
-    text = yaml.safe_dump(tree, default_flow_style=None, width=math.inf, sort_keys=False)
-    for key, note in _NOTES.items():
-        text = re.sub(rf"(?m)^( *{key}:.*)$", lambda line, note=note: f"{line[1]} # {note}", text, count=1)
-    return f"{_FIRST_LINE}\n{text}"
+    values = {"model": model, "hand": found["hand"], **found["gripper"], **found["workspace"]}
+    words = {key: json.dumps(value, ensure_ascii=False) for key, value in values.items()}  # JSON is YAML
+    return _YAML.format(own=f"\n  model: {json.dumps(gripper)}" if gripper else "", **words)

@@ -16,7 +16,7 @@ from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.option import NameOrPath
 from manip_il.robots import ROBOTS
 from manip_il.robots.files import KEYS, ModelFiles, read
-from manip_il.robots.robot import FOUND, GRIPPER, SOFT, UPRIGHT, YAWS, CameraPose, Costs, GripperConfig, Robot
+from manip_il.robots.robot import FOUND, GRIPPER, SOFT, UPRIGHT, YAWS, Costs, GripperConfig, Robot
 from manip_il.robots.spec import arm_joints
 
 SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
@@ -83,10 +83,10 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
         "files": ModelFiles.read("", tree, path.parent),
         "gripper": _gripper(checks.mapping("gripper", tree["gripper"]), path.parent),
     }
-    costs, cameras = checks.mapping("costs", tree.pop("costs", {})), checks.mapping("cameras", tree.pop("cameras", {}))
-    if unknown := [name for name in cameras if name not in SCENE_CAMERAS]:
-        raise UnknownName("camera in a robot's YAML:", unknown[0], SCENE_CAMERAS)
-    said["cameras"] = {name: read(f"cameras.{name}", CameraPose, one) for name, one in cameras.items()}
+    costs = checks.mapping("costs", tree.pop("costs", {}))
+    for camera in checks.mapping("cameras", tree.get("cameras", {})):
+        if camera not in SCENE_CAMERAS:
+            raise UnknownName("camera in a robot's YAML:", camera, SCENE_CAMERAS)
     said |= {key: read(key, kinds[key], value) for key, value in tree.items() if key not in (*KEYS, "gripper")}
     if "joints" not in said:
         said["joints"] = arm_joints(said["name"], said["files"], said["hand"], said["gripper"])

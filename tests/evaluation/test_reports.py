@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.evaluation.eval_report import compare_report, eval_report, run_report
-from manip_il.evaluation.figures import rates_figure
+from manip_il.evaluation.figures import curve_figures
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.side import Member, Side
 
@@ -36,10 +36,9 @@ def test_the_verdict_has_success_and_the_main_phase():
     )
 
 
-def test_every_condition_is_in_the_table_and_the_figure(page: Page):
+def test_every_condition_is_in_the_table(page: Page):
     for name, part in RESULT.by_condition.items():
         assert f"{name} {part.success.n} {part.success}" in page.text
-        assert name in page.figures[0]
 
 
 def test_a_run_has_its_policies_their_curves_and_how_it_was_made():
@@ -76,6 +75,7 @@ def test_whatever_comes_from_outside_is_escaped():
 
 
 def test_a_figure_is_the_same_bytes_and_fits_a_phone():
-    sides = [Side.of("a $name_of$ many words that is rather long", RESULT), SELDOM.sides[0]]
-    assert rates_figure(sides).svg == rates_figure(sides).svg
-    assert rates_figure(sides).width <= 480  # or it would not be readable on a phone
+    sides = [replace(SELDOM.sides[1], name="a $name_of$ many words that is rather long"), SELDOM.sides[0]]
+    once, again = curve_figures(sides)[0], curve_figures(sides)[0]
+    assert once.svg == again.svg
+    assert once.width <= 480  # or it would not be readable on a phone
