@@ -27,7 +27,8 @@ from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.config import CAMERAS, FILM
 from manip_il.sim.render import framed_picture
-from manip_il.sim.world import World
+from manip_il.sim.scene import PREFIX
+from manip_il.sim.world import Scene, World
 from manip_il.tasks.config import make_config
 from manip_il.tasks.envs import scene_of
 
@@ -228,7 +229,8 @@ def _reach_figure(robot: Robot) -> Figure:
 
 def advice(check: RobotCheck) -> tuple[str, ...]:
     """Return what to change in the robot's YAML: first for the arm, then for each task that it cannot do."""
-    lines, space = list[str](), check.robot.workspace
+    space = check.robot.workspace
+    lines = _overlaps(scene_of(check.name, "reach"))
     if check.table < ENOUGH:
         x, y = space.centre
         lines.append(
@@ -248,16 +250,34 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
     return tuple(lines)
 
 
+def _overlaps(scene: Scene) -> list[str]:
+    """Name the bodies that overlap at home, with their depth [mm], in a line; no line if there are none."""
+    depths = dict[str, float]()
+    for contact in _at_home(scene).contact:
+        bodies = sorted(scene.model.geom_bodyid[contact.geom])
+        pair = " and ".join(scene.model.body(body).name.removeprefix(PREFIX) for body in bodies)
+        depths[pair] = max(depths.get(pair, 0.0), -1000 * contact.dist)
+    pairs = ", ".join(f"{pair} by {depth:.1f} mm" for pair, depth in depths.items())
+    remedy = "set another home or base, or exclude their contacts in the model (<exclude body1= body2=/>)."
+    return [f"At home parts overlap: {pairs}: {remedy}"] if pairs else []
+
+
+def _at_home(scene: Scene) -> mujoco.MjData:
+    """The physics of a scene with the arm at home and the gripper open."""
+    data, gripper = mujoco.MjData(scene.model), scene.gripper
+    data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = scene.robot.home
+    gripper.put(data, gripper.most)
+    mujoco.mj_forward(scene.model, data)
+    return data
+
+
 def looks(name: NameOrPath) -> Figure:
     """Draw a robot in its home pose, with the axes of its frame `ee`, as its cameras see it.
 
     Raises `RenderError` without off-screen OpenGL.
     """
     scene = scene_of(name, "reach")
-    data, gripper = mujoco.MjData(scene.model), scene.gripper
-    data.qpos[scene.arm_q] = scene.robot.home
-    gripper.put(data, gripper.most)
-    mujoco.mj_forward(scene.model, data)
+    data = _at_home(scene)
     data.mocap_pos[:, 2] = -9.0  # move goals out of sight
     with drawing(len(CAMERAS), size=_VIEW) as (drawn, axes):
         for axis, camera in zip(axes[0], CAMERAS, strict=True):

@@ -175,10 +175,15 @@ def sweep(robot: Robot) -> Sweep:
     linked = {joint.name: np.array([pose[joint.qposadr[0]] for pose in poses]) for joint in others}
     growth = np.minimum(np.diff(openings), np.diff(shares))
     if openings[-1] - openings[0] < _LEAST_TRAVEL or growth.min() <= 0:
+        place = int((growth <= 0).argmax())  # the first step without growth
+        span = config.closed[0], config.open[0]
+        start, end = np.interp(shares[place : place + 2], [0, 1], span)
         raise UsageError(
-            f"robot {robot.name}: the fingers stand {openings[0]:.4f} m apart when closed, {openings[-1]:.4f} m when "
-            f"open; expected the gap to grow all the way: check gripper.joints (undriven: "
-            f"{', '.join(linked) or 'none'}), closed, open and fingers"
+            f"robot {robot.name}: the fingers stand {openings[0]:.4f} m apart when closed,"
+            f" {openings[-1]:.4f} m when open, and go from {openings[place]:.4f} to"
+            f" {openings[place + 1]:.4f} m as {config.joints[0]} goes from {start:.3f} to {end:.3f};"
+            " expected the gap to grow all the way: check gripper.joints (undriven:"
+            f" {', '.join(linked) or 'none'}), closed, open and fingers"
         )
     holding = jaws  # a turning jaw holds wide objects farther from its tip
     if np.ptp(middles) < _LOPSIDED:

@@ -35,6 +35,7 @@ def load(files: ModelFiles, robot: str) -> mujoco.MjSpec:
     robot: its name. Raises `UsageError` if MuJoCo cannot read the model.
     """
     spec = files.load(robot)
+    _turn_inertias(spec)
     for name in _OF_A_SCENE:
         setattr(spec.compiler, name, getattr(PLAIN.compiler, name))
     return spec
@@ -44,6 +45,20 @@ def joint_range(joint: Any) -> F64:
     """Return a joint's range (2,) [rad or m], whatever the unit of the file that it comes from."""
     in_degrees = joint.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
     return np.radians(joint.range) if in_degrees else np.array(joint.range)
+
+
+def _turn_inertias(spec: mujoco.MjSpec) -> None:
+    """Replace inertia tensors of a URDF by principal moments, as MuJoCo does but without their origin's rotation.
+
+    Its reader gives `iquat`, the axes with that rotation, which its compiler replaces by the tensor's own axes.
+    """
+    for body in spec.bodies:
+        tensor = np.array(body.fullinertia)  # xx, yy, zz, xy, xz, yz
+        if np.isnan(tensor).any() or tuple(body.iquat) == (1, 0, 0, 0):  # no tensor, or one of an MJCF
+            continue
+        moments = np.zeros(3)
+        mujoco.mju_eig3(moments, np.zeros(9), np.zeros(4), tensor[[0, 3, 4, 3, 1, 5, 4, 5, 2]])
+        body.inertia, body.fullinertia = moments, np.full(6, np.nan)
 
 
 def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:
@@ -190,15 +205,14 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
     if robot.fixed:
         _place_bodies(spec, robot.fixed)
     for equality in list(spec.equalities):
-        coupled = {equality.name1, equality.name2} - {""}
-        if equality.type != mujoco.mjtEq.mjEQ_JOINT:
-            continue
+        coupled = _coupled(spec, equality)
         if equality.active and not coupled.isdisjoint(robot.joints):
             raise UsageError(
-                f"robot {robot.name}: an equality couples {', '.join(sorted(coupled))}; expected"
-                " arm joints that move independently (those left out of joints are fixed)"
+                f"robot {robot.name}: equality {equality.name or '(unnamed)'} couples"
+                f" {', '.join(sorted(coupled))}; expected arm joints that move independently (those"
+                " left out of joints are fixed)"
             )
-        if not coupled <= kept:
+        if equality.type == mujoco.mjtEq.mjEQ_JOINT and not coupled <= kept:
             spec.delete(equality)
     for joint in loose:
         spec.delete(joint)
@@ -207,6 +221,22 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
         while root.parent.name != "world":
             root = root.parent
         root.pos = np.array(robot.base)
+
+
+def _coupled(spec: mujoco.MjSpec, equality: mujoco._specs.MjsEquality) -> set[str]:
+    """The names of the joints that an equality of joints names, or that move one of its bodies against the other."""
+    ends = equality.name1, equality.name2
+    if equality.type == mujoco.mjtEq.mjEQ_JOINT:
+        return set(filter(None, ends))
+    one, other = (_joints_below(spec.body(name)) for name in ends)
+    return one ^ other
+
+
+def _joints_below(body: Any) -> set[str]:
+    """The names of the joints between the world and a body."""
+    if body is None or body.name == "world":
+        return set()
+    return {joint.name for joint in body.joints} | _joints_below(body.parent)
 
 
 def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:

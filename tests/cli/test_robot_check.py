@@ -14,7 +14,7 @@ from manip_il.evaluation import robot_check
 from manip_il.robots import reach
 from manip_il.robots.table import get_robot
 
-from ..robots.own import tree_of, write
+from ..robots.own import model_of, tree_of, write
 
 
 @pytest.fixture
@@ -61,6 +61,16 @@ def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_op
     assert "change: lift: task lift: 'object' is 0.050 m wide" in said.out
     assert "cannot do 1 of 2 tasks: lift" in said.err
     assert (out / "check.html").is_file()
+
+
+def test_parts_that_overlap_at_home_are_named_with_their_depth(own: Path, tmp_path: Path, no_opengl: None, capsys):
+    elbow = '<geom size="0.06" pos="0 0 0.3" mass="0.1"/><body name="wrist"'
+    words = ["--quiet", "robot", "check", "--tasks=reach", "--episodes=0"]
+    main([*words, str(own), f"--output_dir={tmp_path / 'apart'}"])
+    assert "At home" not in capsys.readouterr().out
+    thick = with_map(write(tmp_path, "thick", model=model_of().replace('<body name="wrist"', elbow)))
+    main([*words, str(thick), f"--output_dir={tmp_path / 'overlap'}"])
+    assert "fore and hand by 10.0 mm" in capsys.readouterr().out
 
 
 @pytest.mark.gl

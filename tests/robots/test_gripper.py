@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from pathlib import Path
 
@@ -70,12 +71,16 @@ def test_the_measured_opening_is_the_gap_between_the_pads(robot: str):
         assert world.opening == pytest.approx(gap, abs=1e-3)
 
 
-def test_a_gap_that_stops_growing_is_refused_with_the_joints_that_nothing_drives(tmp_path: Path):
+def test_a_gap_that_stops_growing_is_refused_where_it_does_with_the_joints_that_nothing_drives(tmp_path: Path):
     tree = tree_of("hinges")
     tree["gripper"] |= {"joints": ["right"], "closed": [-0.2], "open": [2.8]}
     model = model_of("hinges").replace('range="-0.4 0.8"', 'range="-0.4 3"')
-    with pytest.raises(UsageError, match=r"expected the gap to grow all the way.*undriven: left"):
+    with pytest.raises(UsageError, match=r"(?s)as right goes.*undriven: left") as refused:
         sweep(get_robot(write(tmp_path, tree=tree, model=model)))
+    numbers = r"from (\S+) to (\S+) m as right goes from (\S+) to (\S+);"
+    before, after, start, end = map(float, re.search(numbers, str(refused.value)).groups())
+    assert before >= after > 0.05
+    assert 0.8 < start < end < 2.8
 
 
 @given(st.sampled_from(sorted(ROBOTS)), st.floats(-0.1, 0.3))

@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 from manip_il.errors import UsageError
+from manip_il.robots.files import ModelFiles
 from manip_il.robots.robot import Robot
-from manip_il.robots.spec import arm_model, arm_spec
+from manip_il.robots.rotations import rotation_matrix
+from manip_il.robots.spec import arm_model, arm_spec, load
 from manip_il.robots.suggest import suggest
 from manip_il.robots.table import get_robot
 
@@ -174,6 +176,25 @@ def test_what_is_bolted_on_keeps_its_name(kind: str, tmp_path: Path):
     assert float(arm_model(robot).body_mass.sum()) < 10
 
 
+@pytest.mark.parametrize("tensor", [(1.0, 2.0, 2.5, 0.0, 0.0, 0.0), (1.0, 2.0, 2.5, 0.2, 0.1, -0.3)])
+def test_an_inertia_of_a_urdf_is_turned_with_its_origin(tensor: tuple[float, ...], tmp_path: Path):
+    xx, yy, zz, xy, xz, yz = tensor
+    roll, pitch, yaw = 0.3, 0.4, 0.5
+    rotation = rotation_matrix(np.array([0, 0, yaw])) @ rotation_matrix(np.array([0, pitch, 0]))
+    rotation = rotation @ rotation_matrix(np.array([roll, 0, 0]))
+    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    values = " ".join(f'{name}="{value}"' for name, value in zip(names, tensor, strict=True))
+    turned = f'<inertial><origin rpy="{roll} {pitch} {yaw}"/><mass value="1"/><inertia {values}/></inertial>'
+    path = tmp_path / "arm.urdf"
+    path.write_text(re.sub(r'(?s)(?<=<link name="fore">)<inertial>.*?</inertial>', turned, urdf()))
+    body = load(ModelFiles(path), "arm").compile().body("fore")
+    axes = np.zeros(9)
+    mujoco.mju_quat2Mat(axes, body.iquat)
+    axes = axes.reshape(3, 3)
+    expected = rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T
+    np.testing.assert_allclose(axes @ np.diag(body.inertia) @ axes.T, expected, atol=1e-12)
+
+
 def suggest_joints(kind: str) -> list[str]:
     return ["turn", "shoulder", "elbow", "bend" if kind == "urdf" else "wrist", "roll"]
 
@@ -211,10 +232,12 @@ def with_equality(folder: Path, equality: str) -> mujoco.MjModel:
     [
         ('<joint name="belt" joint1="wrist" joint2="elbow"/>', "elbow, wrist"),
         ('<joint name="belt" joint1="bar" joint2="elbow"/>', "bar, elbow"),
+        ('<connect name="belt" body1="rod" body2="fore" anchor="0 0 0"/>', "bar, elbow"),
+        ('<weld name="belt" body1="upper" body2="wrist"/>', "elbow, wrist"),
     ],
 )
 def test_an_arm_whose_joints_are_coupled_is_refused(equality: str, coupled: str, tmp_path: Path):
-    with pytest.raises(UsageError, match=f"own: an equality couples {coupled};"):
+    with pytest.raises(UsageError, match=f"own: equality belt couples {coupled};"):
         with_equality(tmp_path, equality)
 
 
