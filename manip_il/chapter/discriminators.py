@@ -22,10 +22,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from manip_il.chapter.adversarial_config import DiscriminatorConfig
-from manip_il.chapter.transitions import F32, Transitions
+from manip_il.chapter.config import DiscriminatorConfig
+from manip_il.chapter.episodes import Transitions
 from manip_il.learn.network import MLPNetwork, perceptron
-from manip_il.mdp import I64
+from manip_il.mdp import F32, I64
 
 LARGEST_REWARD = 10.0
 Batch = tuple[Tensor, Tensor, Tensor, Tensor]  # states (B, e), actions (B, n), next states (B, e), log pi (B,)

@@ -6,7 +6,7 @@ The results are the weights of a reward, `reward.json`, and the report of `manip
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from manip_il.chapter.rewards.methods import LEVEL, Learnt, prior_interval
+from manip_il.chapter.rewards import bayesian, max_entropy, max_margin
 from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
@@ -27,11 +27,14 @@ from manip_il.robots.table import get_robot
 from manip_il.tasks.carry.grid import Grid
 from manip_il.tasks.carry.layout import FEATURES, OBSTACLES
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
-from manip_il.tasks.carry.paths import Demonstration, cheapest_path, plan
+from manip_il.tasks.carry.paths import LENGTH, Demonstration, cheapest_path, open_features, plan, rivals
 from manip_il.tasks.envs import scene_of
 from manip_il.tasks.ladder import AT_GOAL
 from manip_il.tasks.pick_place import OBJECT
 
+METHODS = ("max_margin", "bayesian", "max_entropy")
+LEVEL = 0.9  # level of the credible intervals
+_TASTES = 20  # random weight vectors whose paths show whether a feature matters
 CARRY = "carry"
 _MOVED = 0.004  # distance from the start beyond which an object counts as moving [m]
 FILE_NAME = "reward.json"
@@ -88,6 +91,41 @@ def carried_stretch(positions: F64, goal: F64) -> F64:
     there = np.flatnonzero(off < AT_GOAL)
     last = int(there[0]) if len(there) else int(np.argmin(off))
     return positions[first : max(last, first) + 1]
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """The weights that a method found.
+
+    weights: (K,), divided by the weight of length. open: indices of the weights that are not identified, see
+    `open_features`. intervals: the weights' credible intervals, (K, 2), or None. chains: quality of the sampling, in
+    words.
+    """
+
+    method: str
+    weights: F64
+    open: tuple[int, ...] = ()
+    intervals: F64 | None = None
+    chains: str = ""
+
+
+def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.Generator) -> Learnt:
+    """Return the weights that a method of `METHODS` infers from one or more demonstrations."""
+    tastes = bayesian.prior_tastes(_TASTES, demonstrations[0].problem.features.shape[1], rng)
+    unknown = tuple(open_features(demonstrations, rivals(demonstrations, tastes)))
+    if method == "bayesian":
+        found = bayesian.fit(demonstrations, rng)
+        chains, count, _ = found.draws.shape
+        words = f"{chains} chains of {count:,} draws; R-hat at most {found.agreement.max():.3f}."
+        return Learnt(method, found.mean / found.mean[LENGTH], unknown, found.ratios(LENGTH, LEVEL), words)
+    weights = (max_margin if method == "max_margin" else max_entropy).fit(demonstrations)
+    return Learnt(method, weights / weights[LENGTH], unknown)
+
+
+def prior_interval() -> tuple[float, float]:
+    """Return the prior interval of the ratio of two weights; for exponentials P(ratio < r) = r / (1 + r)."""
+    low, high = (1 - LEVEL) / 2, (1 + LEVEL) / 2
+    return low / (1 - low), high / (1 - high)
 
 
 @dataclass(frozen=True)

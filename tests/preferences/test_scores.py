@@ -11,7 +11,7 @@ import pytest
 import torch
 from lerobot.rewards.sarm.rabc import RABCWeights
 
-from manip_il.chapter.preferences.frames import Frames, read_frames
+from manip_il.chapter.preferences.pairs import Frames, read_frames
 from manip_il.chapter.preferences.scores import Scores, roc_auc, write_weights
 from manip_il.learn.samples import rabc_weights
 

@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from manip_il.chapter.theory.bounds import clone, curves, losses_of
-from manip_il.chapter.theory.processes import PROCESSES, RIGHT, WRONG, Process
+from manip_il.chapter.theory.bounds import PROCESSES, RIGHT, WRONG, Process, clone, curves, losses_of
 
 FEW = (10, 40, 160)
 

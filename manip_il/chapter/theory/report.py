@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from manip_il.chapter.theory.bounds import DRAWS, ERROR, LossCurve
+from manip_il.chapter.theory.bounds import DRAWS, ERROR, PROCESSES, LossCurve
 from manip_il.chapter.theory.linear import GUST, OPEN_LOOPS, Drift
-from manip_il.chapter.theory.processes import PROCESSES
 from manip_il.chapter.theory.shift import WRONG, RoundShift, Shift
 from manip_il.evaluation.figures import CLONING, COLOURS, DAGGER, SOFT, Figure, drawing, to_figure
 from manip_il.evaluation.intervals import format_percent
