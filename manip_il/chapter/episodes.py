@@ -88,26 +88,14 @@ class Demonstrations:
             raise UsageError(
                 f"episode_steps is {steps}; expected at least {self.longest}, the steps of the longest demonstration"
             )
-        made = [
-            padded_episode(inputs, encode(targets), 0 if self.hold is None else steps)
-            for inputs, targets in zip(self.inputs, self.targets, strict=True)
-        ]
+        made = list[tuple[F32, F32, F32]]()
+        for inputs, targets in zip(self.inputs, self.targets, strict=True):
+            more = 0 if self.hold is None else max(1, steps - len(inputs) + 1)
+            states = np.pad(inputs, ((0, more), (0, 1)))
+            states[len(inputs) :, -1] = 1.0
+            actions = np.pad(encode(targets), ((0, more), (0, 0)))
+            made.append((states[:-1], actions[:-1], states[1:]))
         return Transitions(*(np.concatenate(parts) for parts in zip(*made, strict=True)))
-
-
-def padded_episode(inputs: F32, actions: F32, steps: int) -> tuple[F32, F32, F32]:
-    """Return states (N, d + 1), actions (N, n) and next states (N, d + 1) of an episode with T steps that ended.
-
-    N is the larger of T and `steps`; rows after the end are absorbing. `steps` 0: the episode did not end; N is T - 1.
-    """
-    states = np.pad(inputs, ((0, 0), (0, 1)))
-    if not steps:
-        return states[:-1], actions[:-1], states[1:]
-    rest = np.zeros((max(1, steps - len(states) + 1), states.shape[1]), np.float32)
-    rest[:, -1] = 1.0
-    states = np.concatenate([states, rest])
-    actions = np.pad(actions, ((0, len(states) - 1 - len(actions)), (0, 0)))
-    return states[:-1], actions, states[1:]
 
 
 def read_demonstrations(

@@ -231,12 +231,10 @@ def start_conversion(start: Checkpoint | None, space: str | None, spec: RobotTas
     """
     if start is None:
         return conversion_for(space or EE_DELTA, spec)
-    if start.kind != MLP:
-        raise UsageError(
-            f"{start.path} is a policy of type {start.kind!r}; expected an mlp, whose actions have a density"
-        )
-    if (loss := start.config["loss"]) not in _CENTRED:
-        raise UsageError(f"{start.path} was trained with loss {loss!r}; expected one of {', '.join(_CENTRED)}")
+    loss = start.config.get("loss")
+    if start.kind != MLP or loss not in _CENTRED:
+        known = ", ".join(_CENTRED)
+        raise UsageError(f"{start.path} is of type {start.kind!r}, loss {loss!r}; expected an mlp with loss {known}")
     start.check_fits(spec)
     if space not in (None, start.space):
         raise MismatchError("action space", str(start.path), start.space, "--action_space", space)

@@ -16,15 +16,13 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from manip_il import checks
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
+from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.checkpoint import CONFIG, META_FILE, WEIGHTS, Origin, in_one_line, read_config, read_origin
 from manip_il.learn.network import read_weights, threads
 from manip_il.mdp import F32, F64
-from manip_il.option import bounded, check_bounds
 
 PREFERENCE = "preference"  # type of a learnt reward in config.json
-_KINDS = {STATE: "STATE", ENVIRONMENT_STATE: "ENV", ACTION: "ACTION"}  # LeRobot's types of the inputs
 _ROWS = 16_384  # rows evaluated at a time
 
 
@@ -38,14 +36,11 @@ class RewardShape:
     columns that the networks do not use.
     """
 
-    members: int = bounded(8, 1, 64)
-    width: int = bounded(32, 1, 4096)
-    depth: int = bounded(2, 1, 32)
+    members: int = 8
+    width: int = 32
+    depth: int = 2
     ways: tuple[tuple[int, ...], ...] = ()
     unread: tuple[int, ...] = ()
-
-    def __post_init__(self) -> None:
-        check_bounds(self)
 
 
 def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
@@ -154,7 +149,8 @@ class LearnedReward:
             raise ManipError(f"{path} is of type {kind}; expected {PREFERENCE!r}, with {META_FILE}")
         with in_one_line(f"{path}: {CONFIG}, {META_FILE} and {WEIGHTS} do not match"):
             shape = RewardShape(**{one.name: config[one.name] for one in fields(RewardShape)})
-            network = RewardNetwork(sum(_widths(origin).values()), shape)
+            width = 2 * len(origin.joint_names) + len(origin.environment_state_names)
+            network = RewardNetwork(width, shape)
             network.load_state_dict(read_weights(path))
         return cls(network, origin)
 
@@ -191,15 +187,7 @@ def write_reward(
     options: the options of the fit. Raises `OSError` if it cannot be written.
     """
     origin = Origin.of(spec, fingerprint, options)
-    features = {key: {"type": _KINDS[key], "shape": [width]} for key, width in _widths(origin).items()}
-    outputs = {"reward": {"type": "REWARD", "shape": [1]}}
-    config = {"type": PREFERENCE, "input_features": features, "output_features": outputs, **asdict(network.shape)}
+    config = {"type": PREFERENCE, **asdict(network.shape)}
     for name, values in ((CONFIG, config), (META_FILE, origin.to_json())):
         (folder / name).write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     save_file({f"model.{name}": tensor for name, tensor in network.state_dict().items()}, folder / WEIGHTS)
-
-
-def _widths(origin: Origin) -> dict[str, int]:
-    """Return the size of each input, in order."""
-    n = len(origin.joint_names)
-    return {STATE: n, ENVIRONMENT_STATE: len(origin.environment_state_names), ACTION: n}

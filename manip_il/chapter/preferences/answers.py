@@ -80,25 +80,22 @@ class Preferences:
 class Answers:
     """All answers except skips. pair: numbers of the pairs, (A,); better: the answers as numbers, see `BETTER`, (A,).
 
-    skipped: number of `skip` answers. contradictory: number of pairs with both a left and a right answer.
+    skipped: number of `skip` answers.
     """
 
     pair: I64
     better: F64
     skipped: int
-    contradictory: int
 
 
 def join_answers(given: Sequence[Preferences]) -> Answers:
     """Join answers; two answers about one pair are two observations, even if they contradict each other."""
     every = [one for preferences in given for one in preferences.answers]
     kept = [one for one in every if one.answer != SKIP]
-    left, right = ({one.pair for one in kept if one.answer == answer} for answer in (LEFT, RIGHT))
     return Answers(
         np.array([one.pair for one in kept], np.int64),
         np.array([BETTER[one.answer] for one in kept], np.float64),
         len(every) - len(kept),
-        len(left & right),
     )
 
 
@@ -106,11 +103,11 @@ def join_answers(given: Sequence[Preferences]) -> Answers:
 class Teacher:
     """One of `TEACHERS`, with B-Pref's parameters.
 
-    beta: rationality; if infinite, the better clip is always chosen. epsilon: share of answers that are reversed.
+    temperature: 1 / beta; if 0, the better clip is always chosen. epsilon: share of answers that are reversed.
     """
 
     name: str
-    beta: float = math.inf
+    temperature: float = 0.0
     epsilon: float = 0.0
 
     @classmethod
@@ -119,15 +116,14 @@ class Teacher:
         name, _, number = text.partition(":")
         if name not in TEACHERS:
             raise UnknownName("teacher", name, TEACHERS)
+        field, default = TEACHERS[name]
         try:
-            value = float(number or TEACHERS[name])
+            value = float(number or default)
         except ValueError:
             value = math.nan
-        if name == "boltzmann" and 0 < value < math.inf:
-            return cls(text, beta=1 / value)
-        if (name == "mistaken" and 0 <= value <= 1) or text == "perfect":
-            return cls(text, epsilon=value)
-        raise UsageError(f"--teacher is {text!r}; expected perfect, boltzmann:TEMPERATURE or mistaken:SHARE")
+        if not 0 <= value <= (1 if field == "epsilon" else math.inf):
+            raise UsageError(f"--teacher is {text!r}; expected perfect, boltzmann:TEMPERATURE or mistaken:SHARE")
+        return cls(text, **{field: value})
 
     def answers(self, clips: Clips, rng: np.random.Generator) -> list[str]:
         """Return the teacher's answer about every pair. Raises `ManipError` if the sources have no true progress."""
@@ -136,15 +132,15 @@ class Teacher:
         returns = clips.progress[clips.rows].sum(-1)
         difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
         mistaken = rng.random(len(returns)) < self.epsilon
-        sure = math.isinf(self.beta)
-        left = difference > 0 if sure else chance < expit(self.beta * difference)
+        left = chance < expit(difference / self.temperature) if self.temperature else difference > 0
         found = np.where(left != mistaken, LEFT, RIGHT)
-        if sure:
+        if not self.temperature:
             found[np.abs(difference) < _ROUNDING] = EQUAL
         return found.tolist()
 
 
-TEACHERS = {"perfect": 0.0, "boltzmann": 1.0, "mistaken": 0.1}  # default of the number after the name
+# name -> the parameter that the number after the name sets, and its default
+TEACHERS = {"perfect": ("epsilon", 0.0), "boltzmann": ("temperature", 1.0), "mistaken": ("epsilon", 0.1)}
 
 
 def answer_pairs(teacher: Teacher, clips: Clips, rng: np.random.Generator) -> Preferences:

@@ -120,8 +120,7 @@ def true_difference(clips: Clips) -> F64 | None:
 def summary_lines(found: FittedReward, answers: Answers) -> list[str]:
     """Return a summary of the answers and the fit as plain lines."""
     given = f"{len(answers.better):,} answers about {len(set(answers.pair.tolist())):,} pairs"
-    lines = [f"{given}, {answers.skipped:,} skipped, {answers.contradictory:,} pairs with contradictory answers"]
-    lines.append(f"agreement with answers on held-out pairs: {found.answered}")
+    lines = [f"{given}, {answers.skipped:,} skipped", f"agreement with answers on held-out pairs: {found.answered}"]
     if found.true is not None:
         lines.append(f"agreement with true progress on held-out pairs: {found.true} of {found.true.n:,}")
     return lines

@@ -19,7 +19,7 @@ from manip_il.data import schema
 from manip_il.data.build import dataset_sha256
 from manip_il.data.dataset import Dataset
 from manip_il.data.fingerprint import canonical_json
-from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
+from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.sources import check_same_sources
@@ -35,16 +35,15 @@ _ROUNDS = "round_*/dataset"  # a run's datasets
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """The frames of one or more datasets: states (N, n), environment states (N, k), actions (N, n).
+    """The frames of one or more datasets.
 
-    actions: as executed. episodes: episode number of each frame, (N,), ascending. progress, success: (N,), None
+    inputs: a reward's, (N, n + k + n): state, environment state and the action as executed.
+    episodes: episode number of each frame, (N,), ascending. progress, success: (N,), None
     if the dataset has no such column.
     """
 
     spec: RobotTaskSpec
-    states: F32
-    environment_states: F32
-    actions: F32
+    inputs: F32
     episodes: I64
     progress: F64 | None = None
     success: NDArray[np.bool_] | None = None
@@ -57,12 +56,7 @@ class Frames:
     @cached_property
     def lengths(self) -> I64:
         """Number of frames of each episode, (E,)."""
-        return np.diff(self.firsts, append=len(self.states))
-
-    @cached_property
-    def inputs(self) -> F32:
-        """A reward's inputs, (N, n + k + n): state, environment state and action."""
-        return np.concatenate([self.states, self.environment_states, self.actions], axis=1)
+        return np.diff(self.firsts, append=len(self.inputs))
 
 
 def read_frames(root: Path) -> Frames:
@@ -75,16 +69,13 @@ def read_frames(root: Path) -> Frames:
     table = dataset.columns([*needed, *more, EPISODE_INDEX])
     for name in (*needed, *more):
         require_finite(f"{root}, column {name}", table[name])
-    state, environment, executed = (np.ascontiguousarray(table[name], np.float32) for name in needed)
     progress, success = table.get(schema.PROGRESS), table.get(schema.SUCCESS)
     return Frames(
         spec,
-        state,
-        environment,
-        executed,
-        np.asarray(table[EPISODE_INDEX], np.int64).reshape(-1),
-        None if progress is None else np.asarray(progress, np.float64).reshape(-1),
-        None if success is None else np.asarray(success, bool).reshape(-1),
+        np.concatenate([table[name] for name in needed], axis=1, dtype=np.float32),
+        table[EPISODE_INDEX].astype(np.int64).ravel(),
+        None if progress is None else progress.astype(np.float64).ravel(),
+        None if success is None else success.astype(bool).ravel(),
     )
 
 
@@ -99,7 +90,7 @@ def find_datasets(folders: Sequence[Path]) -> list[Path]:
     """Return the datasets in folders: for a run the datasets of all its rounds, otherwise the folder itself."""
     found: list[Path] = []
     for folder in folders:
-        found += [path for path in sorted(folder.glob(_ROUNDS)) if (path / INFO).is_file()] or [folder]
+        found += sorted(folder.glob(_ROUNDS)) or [folder]
     return found
 
 
@@ -153,9 +144,9 @@ class Pairs:
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Pairs:
         """Return the pairs that `to_json` has written."""
-        plain = {name: data[name] for name in ("robot", "task", "control_hz", "clip", "seed", "chosen") if name in data}
-        sources = tuple(Source(**one) for one in data["sources"])
-        return cls(**plain, sources=sources, pairs=tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"]))
+        pairs = tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"])
+        plain = {name: data[name] for name in ("robot", "task", "control_hz", "clip", "seed", "chosen")}
+        return cls(**plain, sources=tuple(Source(**one) for one in data["sources"]), pairs=pairs)
 
     @classmethod
     def read(cls, path: Path) -> Pairs:
@@ -185,7 +176,7 @@ class Clips:
     @cached_property
     def offsets(self) -> I64:
         """Row of each source's first frame in `inputs`, (S,)."""
-        return np.cumsum([0, *(len(one.states) for one in self.frames)])[:-1]
+        return np.cumsum([0, *(len(one.inputs) for one in self.frames)])[:-1]
 
     @cached_property
     def inputs(self) -> F32:
@@ -272,7 +263,7 @@ def choose_pairs(
         control_hz=spec.fps,
         clip=length,
         sources=tuple(
-            Source(str(root), dataset_sha256(root), len(one.firsts), len(one.states))
+            Source(str(root), dataset_sha256(root), len(one.firsts), len(one.inputs))
             for root, one in zip(roots, frames, strict=True)
         ),
         pairs=tuple(drawn),

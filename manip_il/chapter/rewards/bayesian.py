@@ -89,15 +89,10 @@ class Posterior:
         return self.pooled[np.linspace(0, len(self.pooled) - 1, count).round().astype(np.int64)]
 
 
-def prior_tastes(count: int, features: int, rng: np.random.Generator, prior: float = PRIOR) -> F64:
-    """Return weight vectors drawn from the prior, (count, features) [1/m]."""
-    return rng.exponential(prior, (count, features))
-
-
 def fit(demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR) -> Posterior:
     """Return the posterior, given that each demonstration was chosen over the cheapest paths for sampled weights."""
-    features = demonstrations[0].problem.features.shape[1]
-    sums = rivals(demonstrations, prior_tastes(TASTES, features, rng, prior))
+    size = demonstrations[0].problem.features.shape[1]
+    sums = rivals(demonstrations, rng.exponential(prior, (TASTES, size)))
     for _ in range(_ROUNDS):
         quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 5, _WARM_UP)
         sums = add_rivals(demonstrations, sums, quick.thin(_MORE))
