@@ -97,15 +97,13 @@ class Learnt:
     """The weights that a method found.
 
     weights: (K,), divided by the weight of length. open: indices of the weights that are not identified, see
-    `open_features`. intervals: the weights' credible intervals, (K, 2), or None. chains: quality of the sampling, in
-    words.
+    `open_features`. intervals: the weights' credible intervals, (K, 2), or None.
     """
 
     method: str
     weights: F64
     open: tuple[int, ...] = ()
     intervals: F64 | None = None
-    chains: str = ""
 
 
 def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.Generator) -> Learnt:
@@ -114,9 +112,7 @@ def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.G
     unknown = tuple(open_features(demonstrations, rivals(demonstrations, tastes)))
     if method == "bayesian":
         found = bayesian.fit(demonstrations, rng)
-        chains, count, _ = found.draws.shape
-        words = f"{chains} chains of {count:,} draws; R-hat at most {found.agreement.max():.3f}."
-        return Learnt(method, found.mean / found.mean[LENGTH], unknown, found.ratios(LENGTH, LEVEL), words)
+        return Learnt(method, found.mean / found.mean[LENGTH], unknown, found.ratios(LENGTH, LEVEL))
     weights = (max_margin if method == "max_margin" else max_entropy).fit(demonstrations)
     return Learnt(method, weights / weights[LENGTH], unknown)
 
@@ -194,14 +190,13 @@ def weight_table(found: Inverse) -> Table:
 
 def inverse_report(found: Inverse) -> Report:
     """Return the report of the learnt weights."""
-    notes = [found.learnt.chains] if found.learnt.chains else []
-    if found.learnt.open:
-        names = ", ".join(found.open_names)
-        notes.append(
+    names, notes = ", ".join(found.open_names), ()
+    if names:
+        notes = (
             f"No demonstration differs from its alternatives in {names}, so these weights are not identified. "
-            "The reward omits them, and plans with 0 instead."
+            "The reward omits them, and plans with 0 instead.",
         )
-    weights = Section("What a metre costs", tables=(weight_table(found),), notes=tuple(notes))
+    weights = Section("What a metre costs", tables=(weight_table(found),), notes=notes)
     costs = Section(
         "The cost over the table",
         figures=(_cost_figure(found),),

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from manip_il.chapter.preferences.answers import Teacher, answer_pairs, join_answers
 from manip_il.chapter.preferences.fitting import deal, fit_answers
+from manip_il.chapter.preferences.pairs import Teacher, answer_pairs, join_answers
 from manip_il.chapter.reward import LearnedReward, RewardShape, ways_of, write_reward
 from manip_il.data.dataset import Dataset
 from manip_il.errors import MismatchError

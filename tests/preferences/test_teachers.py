@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from manip_il.chapter.preferences.answers import Answer, Preferences, Teacher, answer_pairs, join_answers
 from manip_il.chapter.preferences.fitting import true_difference
-from manip_il.chapter.preferences.pairs import Clips
+from manip_il.chapter.preferences.pairs import Answer, Clips, Preferences, Teacher, answer_pairs, join_answers
 
 from .conftest import clips_of
 

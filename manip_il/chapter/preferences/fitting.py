@@ -22,8 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from manip_il.chapter.preferences.answers import Answers
-from manip_il.chapter.preferences.pairs import Clips
+from manip_il.chapter.preferences.pairs import Answers, Clips
 from manip_il.chapter.reward import RewardNetwork, RewardShape
 from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import Proportion

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
-from manip_il.chapter.preferences.answers import Preferences, Teacher, answer_pairs, join_answers
 from manip_il.chapter.preferences.asking import render_films, render_page
 from manip_il.chapter.preferences.fitting import fit_answers, summary_lines
-from manip_il.chapter.preferences.pairs import Pairs, choose_pairs, find_datasets, join_pairs, read_clips
+from manip_il.chapter.preferences.pairs import (
+    Pairs,
+    Preferences,
+    Teacher,
+    answer_pairs,
+    choose_pairs,
+    find_datasets,
+    join_answers,
+    join_pairs,
+    read_clips,
+)
 from manip_il.chapter.reward import LearnedReward, shape_for, write_reward
 from manip_il.cli.progress import progress, say, say_next
 from manip_il.cli.reward import AnswerOptions, AskOptions, FitOptions, OfPairs, PairsOptions
