@@ -140,7 +140,7 @@ def _linear(theory: Theory) -> Section:
 
 def _linear_figure(drifts: Sequence[Drift]) -> Figure:
     """Distance of clones from the expert over the steps."""
-    with drawing(1, size=(5.4, 3.4)) as (drawn, axes):
+    with drawing(1, size=(5.4, 4.4)) as (drawn, axes):
         [[axis]] = axes
         for drift in drifts:
             name, noise = OPEN_LOOPS[drift.pole], ", noisy" if drift.noise else ""
@@ -149,7 +149,7 @@ def _linear_figure(drifts: Sequence[Drift]) -> Figure:
             axis.plot(range(1, len(drift.apart) + 1), np.maximum(drift.apart, _LEAST), label=label, **look)
         axis.axhline(GUST, color=SOFT, lw=0.8, ls=":")
         axis.set(yscale="log", xlabel="step", ylabel="distance from the expert", ylim=(_LEAST, 100))
-        drawn.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        drawn.legend(*axis.get_legend_handles_labels(), loc="outside lower center")
         return to_figure(drawn, "Distance of clones from the expert over the steps, on stable and unstable systems")
 
 
