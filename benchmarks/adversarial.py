@@ -2,7 +2,7 @@
 
 python benchmarks/adversarial.py [--seeds 10] [--env NAME] [--algorithm gail|airl] [--quick]
 
-The loops are those of `algorithms/gail.py` and `algorithms/airl.py`, with the same discriminators, PPO and network as
+The loops are those of `manip_il.chapter.learning`, with the same discriminators, PPO and network as
 for robots. Every training seed begins with a new policy and its own demonstrations; its last policy acts without
 exploring on 100 episodes, the same for all. With the mean returns R, the share is
 
@@ -29,13 +29,11 @@ from _machine import describe_machine
 from numpy.typing import NDArray
 from scipy.stats import trim_mean
 
-from manip_il.chapter.actor_critic import Learner, seed_generators
-from manip_il.chapter.adversarial_config import DiscriminatorConfig, PPOConfig
-from manip_il.chapter.airl import airl
+from manip_il.chapter.config import DiscriminatorConfig, PPOConfig
 from manip_il.chapter.discriminators import Discriminator
-from manip_il.chapter.gail import gail
-from manip_il.chapter.transitions import Demonstrations, Transitions
-from manip_il.chapter.vector_env import ActionRange, Lockstep
+from manip_il.chapter.episodes import ActionRange, Demonstrations, Lockstep, Transitions
+from manip_il.chapter.learning import airl, gail
+from manip_il.chapter.ppo import Learner, seed_generators
 from manip_il.learn.network import MLPNetwork, Shape, fit_statistics, threads
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 
@@ -158,12 +156,12 @@ class Run:
         actions = ActionRange(*(getattr(self._network, one).numpy().copy() for one in names))
         episodes = [ENVIRONMENTS[name]() for _ in range(settings.episodes)]
         self._envs = Lockstep(episodes, actions, settings.episode_steps)
-        self._learner = Learner(self._network, settings.ppo, self._envs, settings.episode_steps, settings.log_std)
+        self._learner = Learner(self._network, settings.ppo, self._envs, settings.log_std)
         self._expert = shown.padded(settings.episode_steps, actions.normalised)
 
-    def keep(self, make: Callable[[MLPNetwork], Discriminator]) -> Discriminator:
+    def discriminator(self, gamma: float | None = None) -> Discriminator:
         seed_generators(self._stream("discriminator"))
-        return make(self._network)
+        return Discriminator(self._settings.discriminator, self._network, gamma)
 
     def agent(self) -> Run:
         return self
@@ -174,9 +172,8 @@ class Run:
     def rollouts(self) -> Transitions:
         count = self._settings.episodes
         self._number += 1
-        self._envs.seed(stream_seeds("reinforcement", (self._number + 1) * count, self._seed)[-count])
         seed_generators(self._stream("rollouts"))
-        rows = self._learner.collect()
+        rows = self._learner.collect(stream_seeds("reinforcement", (self._number + 1) * count, self._seed)[-count])
         self.simulated += self._envs.simulated
         return rows
 

@@ -23,8 +23,7 @@ import numpy as np
 from _machine import describe_machine
 from numpy.typing import NDArray
 
-from manip_il.chapter.inverse import CARRY, read_carried
-from manip_il.chapter.rewards.methods import METHODS, learn
+from manip_il.chapter.inverse import CARRY, METHODS, learn, read_carried
 from manip_il.cli.main import main as manip_il
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 from manip_il.tasks.carry.grid import Grid

@@ -20,10 +20,9 @@ import mujoco
 import numpy as np
 from _machine import describe_machine
 
-from manip_il.algorithms.run import Run
-from manip_il.chapter.discriminators import Discriminator
-from manip_il.chapter.learning_config import LearningConfig
-from manip_il.chapter.vector_env import RobotEpisode
+from manip_il.chapter.config import LearningConfig
+from manip_il.chapter.episodes import RobotEpisode
+from manip_il.chapter.learning import LearningRun
 from manip_il.cli.main import main as command
 from manip_il.collect.workers import Engine
 from manip_il.sim.env import ManipEnv
@@ -75,12 +74,11 @@ def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[
         raise SystemExit("recording failed")
     env = make_config(robot, task)
     config = LearningConfig(method="gail", env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER)
-    run = Run(config, folder, Engine())
+    run = LearningRun(config, folder, Engine())
     agent = run.agent()
     recorded = [Recorded(env, None) for _ in range(config.episodes)]
-    for one, episode in zip(agent.envs.envs, recorded, strict=True):
-        one.episode = episode
-    d = agent.keep(lambda actor: Discriminator(config.discriminator, actor))
+    agent.envs.episodes = recorded
+    d = agent.discriminator()
     found = []
     for _ in range(iterations):
         times = [time.process_time()]

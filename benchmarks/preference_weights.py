@@ -25,8 +25,7 @@ import numpy as np
 from _machine import describe_machine
 
 from manip_il.chapter.preferences.fitting import TIE, true_difference
-from manip_il.chapter.preferences.frames import find_datasets
-from manip_il.chapter.preferences.pairs import choose_pairs
+from manip_il.chapter.preferences.pairs import choose_pairs, find_datasets
 from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.main import main as manip_il
 from manip_il.data import schema
@@ -118,7 +117,7 @@ def clone(folder: Path, name: str, source: object, steps: int, seeds: int) -> Ev
 def fresh_agreement(rounds: Path, reward: Path, count: int) -> Proportion:
     """Return the share of new pairs of clips, without ties, on which the reward agrees with true progress."""
     clips = choose_pairs(find_datasets([rounds]), _CLIP, count, 0, np.random.default_rng(999))
-    returns = LearnedReward.load(reward / PRETRAINED_MODEL).of_inputs(clips.inputs)[clips.rows].sum(-1)
+    returns = LearnedReward.load(reward / PRETRAINED_MODEL)(clips.inputs)[clips.rows].sum(-1)
     difference = true_difference(clips)
     assert difference is not None
     told = np.abs(difference) >= TIE

@@ -25,8 +25,7 @@ import numpy as np
 from _machine import describe_machine
 from scipy.stats import binomtest
 
-from manip_il.chapter.inverse import CARRY, carried_stretch, read_carried
-from manip_il.chapter.rewards.methods import METHODS, learn
+from manip_il.chapter.inverse import CARRY, METHODS, carried_stretch, learn, read_carried
 from manip_il.cli.main import main as manip_il
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_spec

@@ -1,14 +1,12 @@
-"""One run of a method in a folder: the steps that the loops of `cloning`, `dart`, `dagger`, `gail`, `airl`, `ppo` take.
+"""One run of a method in a folder: the steps that the loops of `cloning`, `dart` and `dagger` take.
 
 Every step writes its complete result into the folder, and is skipped if the result exists. So a killed run is resumed
 by running its loop again.
 
-    round_003/           imitation: see `rounds`
-    held_out/            imitation: expert demonstrations that no policy learns from
-    dataset/             imitation: all rounds' labels, once the run has ended
-    checkpoints/last/    reinforcement learning: the last finished iteration, see `agent`
-    validation/          reinforcement learning: every validated policy and its eval.json, by iteration
-    metrics.jsonl        a line per round or iteration
+    round_003/           see `rounds`
+    held_out/            expert demonstrations that no policy learns from
+    dataset/             all rounds' labels, once the run has ended
+    metrics.jsonl        a line per round
     best/                the policy with the highest validation success; on a tie the latest
 """
 
@@ -20,9 +18,9 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from manip_il.algorithms.results import VALIDATION, Result, Stopwatch, Watch, best_result, best_validation, validations
+from manip_il.algorithms.results import Result, Stopwatch, Watch, best_result
 from manip_il.algorithms.rounds import (
     DATASET,
     JOURNALS,
@@ -52,27 +50,23 @@ from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes, read_journal
 from manip_il.data.json_lines import append_line, read_lines
-from manip_il.data.ownership import CHECKPOINT, kind_of
+from manip_il.data.ownership import CHECKPOINT
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import METRICS_FILE
-from manip_il.evaluation.runner import HOLD, evaluate
-from manip_il.learn.training_state import PRETRAINED_MODEL, last_checkpoint
+from manip_il.evaluation.runner import evaluate
+from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.events import standard_in
 
-if TYPE_CHECKING:  # rollouts alone do not need torch and stable-baselines3
-    from manip_il.chapter.agent import Agent
-
 BEST = "best"
-CHECKPOINTS = "checkpoints"
 HELD_OUT = "held_out"
 
 
 class Run:
     """A run's folder, its workers, and its results so far.
 
-    config: a `RunConfig` for imitation, a `LearningConfig` for reinforcement learning.
+    config: a `RunConfig`, or, in the subclass of `manip_il.chapter.learning`, a `LearningConfig`.
     """
 
     def __init__(self, config: Any, folder: Path, engine: Engine, watch: Watch | None = None):
@@ -216,57 +210,6 @@ class Run:
             validated=validation,
             seconds=self._clock.take(),
         )
-
-    def agent(self) -> Agent:
-        """Return a new agent for reinforcement learning."""
-        from manip_il.chapter.agent import Agent
-
-        return Agent(self.config, self._clock)
-
-    def begin(self, agent: Agent) -> Iterator[Result]:
-        """Load the agent's last finished iteration and yield its result; else yield that of the initial clone, if any.
-
-        An iteration thus gets its line in `metrics.jsonl` even if the run was killed right after saving its checkpoint.
-        """
-        checkpoint, start = last_checkpoint(self.folder, resume=True), self.config.start
-        if checkpoint is not None:
-            agent.load(checkpoint)
-            yield self._iteration(agent, checkpoint / PRETRAINED_MODEL)
-        elif start is not None:
-            yield self._iteration(agent, start)
-
-    def finish(self, agent: Agent) -> Result:
-        """Save the finished iteration; validate its policy if that is due."""
-        folder = self.folder / CHECKPOINTS
-        agent.save(folder / f"{agent.number:06d}")
-        for other in folder.iterdir():
-            if not other.is_symlink() and other.name != f"{agent.number:06d}" and kind_of(other) == CHECKPOINT:
-                shutil.rmtree(other, ignore_errors=True)
-        self._watch.on_step()
-        return self._iteration(agent, folder / "last" / PRETRAINED_MODEL)
-
-    def _iteration(self, agent: Agent, policy: Path) -> Result:
-        """The result of an agent's iteration, validated if validation is due; iteration 0 is always validated."""
-        every, validated = self.config.validation_every, None
-        due = agent.simulated // every != agent.validated_at // every
-        if due or agent.simulated >= self.config.steps or agent.number == 0:
-            agent.validated_at = agent.simulated
-            validated = self._validate_copy(policy, agent.number)
-        episodes, seconds = agent.number * self.config.episodes, self._clock.take()
-        metrics = agent.metrics
-        return Result("iteration", agent.number, agent.simulated, episodes, metrics, policy, validated, seconds)
-
-    def _validate_copy(self, policy: Path, number: int) -> EvalResult:
-        """Copy a policy into the run and evaluate it, unless that is done; copy it to `best` if it is the best."""
-        here = self.folder / VALIDATION / f"{number:06d}"
-        if not here.is_dir():
-            with new_folder(here) as new:
-                shutil.copytree(policy, new / PRETRAINED_MODEL)
-        job = RolloutJob(self.config.env, PolicyDriver((here / PRETRAINED_MODEL,)), HOLD, label="last")
-        found = self._evaluate(job, here / FILE_NAME, f"iteration {number}")
-        if number == best_validation(validations(self.folder)):
-            self._keep_best(policy)
-        return found
 
     def _evaluate(self, job: RolloutJob, path: Path, name: str) -> EvalResult:
         """Evaluate a job on the validation seeds and write `path`, unless it exists. name: stored in the file."""

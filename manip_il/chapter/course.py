@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from manip_il.algorithms.run import Run
-from manip_il.chapter.inverse import Inverse, read_carried
-from manip_il.chapter.learning_config import LearningConfig
-from manip_il.chapter.preferences.answers import Teacher, answer_pairs, join_answers
+from manip_il.chapter.config import LearningConfig
+from manip_il.chapter.inverse import Inverse, Learnt, learn, read_carried
+from manip_il.chapter.learning import LearningRun
 from manip_il.chapter.preferences.fitting import fit_answers
-from manip_il.chapter.preferences.frames import read_frames
-from manip_il.chapter.preferences.pairs import choose_pairs
+from manip_il.chapter.preferences.pairs import Teacher, answer_pairs, choose_pairs, join_answers, read_frames
 from manip_il.chapter.reward import LearnedReward, shape_for
-from manip_il.chapter.rewards.methods import Learnt, learn
-from manip_il.chapter.theory.bounds import curves
-from manip_il.chapter.theory.processes import PROCESSES
+from manip_il.chapter.theory.bounds import PROCESSES, curves
 from manip_il.chapter.theory.shift import measure_shift
 from manip_il.collect.workers import Engine
 from manip_il.learn.checkpoint import Origin
@@ -26,9 +22,9 @@ __all__ = [
     "Inverse",
     "LearnedReward",
     "LearningConfig",
+    "LearningRun",
     "Learnt",
     "Origin",
-    "Run",
     "Teacher",
     "answer_pairs",
     "choose_pairs",

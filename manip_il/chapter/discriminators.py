@@ -22,13 +22,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from manip_il.chapter.adversarial_config import DiscriminatorConfig
-from manip_il.chapter.transitions import F32, Transitions
+from manip_il.chapter.config import DiscriminatorConfig
+from manip_il.chapter.episodes import Transitions
 from manip_il.learn.network import MLPNetwork, perceptron
-from manip_il.mdp import I64
+from manip_il.mdp import F32
 
 LARGEST_REWARD = 10.0
-Batch = tuple[Tensor, Tensor, Tensor, Tensor]  # states (B, e), actions (B, n), next states (B, e), log pi (B,)
+Batch = tuple[Tensor, ...]  # states (B, e), actions (B, n), next states (B, e), log pi (B, 1)
 
 
 class Discriminator(nn.Module):
@@ -62,7 +62,7 @@ class Discriminator(nn.Module):
         g = self.g(torch.cat([states, actions], dim=1))
         if self.h is None:
             return g.squeeze(1)
-        return (g + self._gamma * self.h(next_states) - self.h(states)).squeeze(1) - log_prob
+        return (g + self._gamma * self.h(next_states) - self.h(states) - log_prob).squeeze(1)
 
     def reward(self, learner: Transitions, log_probs: F32 | None = None) -> F32:
         """Return the reward of every transition, (N,), clipped to +-10.
@@ -103,18 +103,16 @@ class Discriminator(nn.Module):
     def _gradient_penalty(self, expert: Batch, learner: Batch, rng: np.random.Generator) -> Tensor:
         """Return the mean (|gradient of logit| - 1)^2 at random points between the batches (Gulrajani et al. 2017)."""
         share = torch.from_numpy(rng.random((len(expert[0]), 1), dtype=np.float32))
-        mixed = [a * share + b * (1 - share) for a, b in zip(expert[:3], learner[:3], strict=True)]
-        inputs = [one.requires_grad_() for one in mixed]
-        log_prob = expert[3] * share[:, 0] + learner[3] * (1 - share[:, 0])
-        logits = self.logits((inputs[0], inputs[1], inputs[2], log_prob))
-        found = torch.autograd.grad(logits.sum(), inputs, create_graph=True, allow_unused=True)
+        mixed = tuple(a * share + b * (1 - share) for a, b in zip(expert, learner, strict=True))
+        inputs = [one.requires_grad_() for one in mixed[:3]]
+        found = torch.autograd.grad(self.logits(mixed).sum(), inputs, create_graph=True, allow_unused=True)
         gradients = torch.cat([one for one in found if one is not None], dim=1)
         return (gradients.norm(dim=1) - 1.0).square().mean()
 
     def _encode(self, rows: Transitions, log_probs: F32 | None) -> Batch:
         log_prob = torch.zeros(len(rows)) if log_probs is None else torch.from_numpy(log_probs)
         actions = torch.from_numpy(rows.actions) * self.free * (1.0 - torch.from_numpy(rows.states[:, -1:]))
-        return self._state(rows.states), actions, self._state(rows.next_states), log_prob
+        return self._state(rows.states), actions, self._state(rows.next_states), log_prob[:, None]
 
     def _state(self, states: F32) -> Tensor:
         given = torch.from_numpy(states)
@@ -123,6 +121,5 @@ class Discriminator(nn.Module):
 
 
 def _drawn(data: Batch, count: int, rng: np.random.Generator) -> Batch:
-    rows: I64 = rng.integers(len(data[0]), size=count)
-    index = torch.from_numpy(rows)
-    return data[0][index], data[1][index], data[2][index], data[3][index]
+    rows = torch.from_numpy(rng.integers(len(data[0]), size=count))
+    return tuple(column[rows] for column in data)

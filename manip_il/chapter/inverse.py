@@ -6,7 +6,7 @@ The results are the weights of a reward, `reward.json`, and the report of `manip
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,29 +14,31 @@ from typing import Any
 
 import numpy as np
 
-from manip_il.chapter.rewards.methods import LEVEL, Learnt, prior_interval
+from manip_il.chapter.rewards import bayesian, max_entropy, max_margin
 from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError
-from manip_il.evaluation.figures import CLONING, DAGGER, SOFT, Figure, drawing, to_figure
+from manip_il.evaluation.figures import CLONING, DAGGER, Figure, drawing, to_figure
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
 from manip_il.mdp import F64, I64
 from manip_il.robots.table import get_robot
 from manip_il.tasks.carry.grid import Grid
-from manip_il.tasks.carry.layout import FEATURES, OBSTACLES
+from manip_il.tasks.carry.layout import FEATURES
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
-from manip_il.tasks.carry.paths import Demonstration, cheapest_path, plan
+from manip_il.tasks.carry.paths import LENGTH, Demonstration, cheapest_path, open_features, plan, rivals
 from manip_il.tasks.envs import scene_of
 from manip_il.tasks.ladder import AT_GOAL
 from manip_il.tasks.pick_place import OBJECT
 
+METHODS = ("max_margin", "bayesian", "max_entropy")
+LEVEL = 0.9  # level of the credible intervals
+_TASTES = 20  # random weight vectors whose paths show whether a feature matters
 CARRY = "carry"
 _MOVED = 0.004  # distance from the start beyond which an object counts as moving [m]
 FILE_NAME = "reward.json"
 _PANELS = 3
-_SIDE = 80  # points along each side of the map
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,31 @@ def carried_stretch(positions: F64, goal: F64) -> F64:
 
 
 @dataclass(frozen=True)
+class Learnt:
+    """The weights that a method found.
+
+    weights: (K,), divided by the weight of length. open: indices of the weights that are not identified, see
+    `open_features`. intervals: the weights' credible intervals, (K, 2), or None.
+    """
+
+    method: str
+    weights: F64
+    open: tuple[int, ...] = ()
+    intervals: F64 | None = None
+
+
+def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.Generator) -> Learnt:
+    """Return the weights that a method of `METHODS` infers from one or more demonstrations."""
+    tastes = rng.exponential(bayesian.PRIOR, (_TASTES, demonstrations[0].problem.features.shape[1]))
+    unknown = tuple(open_features(demonstrations, rivals(demonstrations, tastes)))
+    if method == "bayesian":
+        found = bayesian.fit(demonstrations, rng)
+        return Learnt(method, found.mean / found.mean[LENGTH], unknown, found.ratios(LENGTH, LEVEL))
+    weights = (max_margin if method == "max_margin" else max_entropy).fit(demonstrations)
+    return Learnt(method, weights / weights[LENGTH], unknown)
+
+
+@dataclass(frozen=True)
 class Inverse:
     """Learnt weights and the paths that they were learnt from. source: the dataset, in words."""
 
@@ -137,7 +164,7 @@ class Inverse:
             "weights": [float(self.weights[k]) for k in known],
             "intervals": None if intervals is None else [intervals[k].tolist() for k in known],
             "level": None if intervals is None else LEVEL,
-            "not_identified": {name: list(prior_interval()) for name in self.open_names},
+            "not_identified": self.open_names,
             "method": self.learnt.method,
             "demonstrations": len(self.carried),
             "source": self.source,
@@ -153,7 +180,7 @@ def weight_table(found: Inverse) -> Table:
     for k, name in enumerate(FEATURES):
         weight, interval = f"{learnt.weights[k]:.2f}", ""
         if k in learnt.open:
-            weight, interval = "not identified", "[{:.2g}, {:.2g}] (prior)".format(*prior_interval())
+            weight = "not identified"
         elif learnt.intervals is not None:
             interval = "[{:.2f}, {:.2f}]".format(*learnt.intervals[k])
         rows.append((name.replace("_", " "), weight, interval, f"{shown[k]:.3f}", f"{planned[k]:.3f}"))
@@ -161,28 +188,20 @@ def weight_table(found: Inverse) -> Table:
     return Table(columns, tuple(rows)).filled()
 
 
-def open_line(found: Inverse) -> str:
-    """Return a sentence that names the weights that are not identified; empty if there are none."""
-    if not found.open_names:
-        return ""
-    return (
-        f"No demonstration differs from its alternatives in {', '.join(found.open_names)}, so these weights are not "
-        "identified. The reward omits them, and plans with 0 instead."
-    )
-
-
 def inverse_report(found: Inverse) -> Report:
     """Return the report of the learnt weights."""
-    weights = Section(
-        "What a metre costs",
-        tables=(weight_table(found),),
-        notes=tuple(one for one in (found.learnt.chains, open_line(found)) if one),
-    )
+    names, notes = ", ".join(found.open_names), ()
+    if names:
+        notes = (
+            f"No demonstration differs from its alternatives in {names}, so these weights are not identified. "
+            "The reward omits them, and plans with 0 instead.",
+        )
+    weights = Section("What a metre costs", tables=(weight_table(found),), notes=notes)
     costs = Section(
         "The cost over the table",
         figures=(_cost_figure(found),),
         notes=(
-            "Cost of a metre of path, seen from above, at the height at which the object was carried; things in grey. "
+            "Cost of a metre of path, seen from above, at the height at which the object was carried. "
             "Solid: demonstrated path. Dashed: cheapest path for these weights.",
         ),
     )
@@ -196,35 +215,22 @@ def inverse_report(found: Inverse) -> Report:
 
 def _cost_figure(found: Inverse) -> Figure:
     """Maps of the cost per metre, with demonstrated and planned path, for layouts with the most things on the table."""
-    count = [len(one.grid.layout.places) + (one.grid.layout.edge is not None) for one in found.carried]
-    chosen = np.argsort(-np.array(count), kind="stable")[:_PANELS].tolist()
-    with drawing(len(chosen), size=(3.0, 3.1)) as (drawn, axes):
-        for axis, number in zip(axes[0], chosen, strict=True):
-            one = found.carried[number]
-            image = _draw_cost(axis, one, found.weights)
-            path = one.grid.points[found.replanned[number][0]]
+    pairs = zip(found.carried, found.replanned, strict=True)
+    shown = sorted(pairs, key=lambda pair: -len(pair[0].grid.layout.places))[:_PANELS]
+    with drawing(len(shown), size=(3.0, 3.1)) as (drawn, axes):
+        for axis, (one, (path, _)) in zip(axes[0], shown, strict=True):
+            grid, layout = one.grid, one.grid.layout
+            level = np.abs(grid.points[:, 2] - np.median(one.positions[:, 2])).argmin() % grid.shape[2]
+            cost = (layout.densities(grid.points) @ found.weights).reshape(grid.shape)[:, :, level].T
+            (left, near, _), (right, far, _) = grid.points[[0, -1]]
+            extent = (left, right, near, far)
+            image = axis.imshow(cost, origin="lower", extent=extent, cmap="Greens", interpolation="bilinear")
+            for name, place in layout.places:
+                axis.annotate(name, place, ha="center", va="center", fontsize=6.5)
             axis.plot(*one.positions[:, :2].T, "-", color=DAGGER, lw=1.8, label="demonstrated")
-            axis.plot(*path[:, :2].T, "--", color=CLONING, lw=1.6, label="re-planned")
-            axis.plot(*one.grid.layout.goal[:2], "o", color=CLONING, ms=5)
+            axis.plot(*grid.points[path, :2].T, "--", color=CLONING, lw=1.6, label="re-planned")
             drawn.colorbar(image, ax=axis, location="bottom", shrink=0.8, pad=0.02)
-            axis.set(title=f"episode {one.episode}", xticks=[], yticks=[], aspect="equal")
+            axis.set(title=f"episode {one.episode}", xticks=[], yticks=[])
             axis.grid(visible=False)
         drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
         return to_figure(drawn, "Cost of a metre of path over the table, with demonstrated and re-planned paths")
-
-
-def _draw_cost(axis: Any, one: Carried, weights: F64) -> Any:
-    """Draw the cost per metre at the path's median height, and the obstacles, seen from above."""
-    layout, points = one.grid.layout, one.grid.points
-    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    x, y = (np.linspace(low[k], high[k], _SIDE) for k in (0, 1))
-    height = float(np.median(one.positions[:, 2]))
-    places = np.stack([*(part.ravel() for part in np.meshgrid(x, y)), np.full(_SIDE**2, height)], axis=1)
-    cost = (layout.densities(places) @ weights).reshape(_SIDE, _SIDE)
-    image = axis.imshow(cost, origin="lower", extent=(low[0], high[0], low[1], high[1]), cmap="Greens")
-    for name, (px, py) in layout.places:
-        half = layout.scale * np.array(OBSTACLES[name].half)
-        box_x, box_y = px + half[0] * np.array([-1, 1, 1, -1, -1]), py + half[1] * np.array([-1, -1, 1, 1, -1])
-        axis.fill(box_x, box_y, color=SOFT, alpha=0.6, lw=0)
-        axis.annotate(name, (px, py), ha="center", va="center", fontsize=6.5)
-    return image

@@ -6,8 +6,7 @@ from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
-from manip_il.chapter.adversarial_config import DiscriminatorConfig, PPOConfig
-from manip_il.chapter.learning_config import LearningConfig
+from manip_il.chapter.config import DiscriminatorConfig, LearningConfig, PPOConfig
 from manip_il.cli.common_options import DatasetRoots, EngineOptions
 from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import ResumableOutput

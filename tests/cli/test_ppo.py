@@ -25,7 +25,7 @@ def reward(folder: Path, env: EnvConfig = ENV) -> Path:
     torch.manual_seed(0)
     width = 2 * len(spec.joint_names) + len(spec.environment_state_names)
     folder.mkdir(parents=True)
-    write_reward(folder, RewardNetwork(width, shape), shape, spec, {}, {})
+    write_reward(folder, RewardNetwork(width, shape), spec, {}, {})
     return folder
 
 

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
-from manip_il.chapter.preferences.answers import Preferences
 from manip_il.chapter.preferences.asking import render_films, render_page
-from manip_il.chapter.preferences.pairs import Pairs
+from manip_il.chapter.preferences.pairs import Pairs, Preferences
 from manip_il.evaluation.film import encode_mp4
 
 from ..evaluation.browser import PATIENCE, Opened, chromium, opened

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from manip_il.chapter.preferences.answers import Teacher, answer_pairs, join_answers
-from manip_il.chapter.preferences.fitting import fit_answers
-from manip_il.chapter.reward import (
-    Compared,
-    LearnedReward,
-    RewardShape,
-    deal,
-    fit_reward,
-    ways_of,
-    write_reward,
-)
+from manip_il.chapter.preferences.fitting import deal, fit_answers
+from manip_il.chapter.preferences.pairs import Teacher, answer_pairs, join_answers
+from manip_il.chapter.reward import LearnedReward, RewardShape, ways_of, write_reward
 from manip_il.data.dataset import Dataset
 from manip_il.errors import MismatchError
 
@@ -39,13 +30,13 @@ def fitted(clips, answers):
 @pytest.fixture(scope="module")
 def folder(fitted, clips, tmp_path_factory):
     made = tmp_path_factory.mktemp("reward")
-    write_reward(made, fitted.fit.network, fitted.shape, clips.frames[0].spec, {"seed": 0}, {})
+    write_reward(made, fitted.network, clips.frames[0].spec, {"seed": 0}, {})
     return made
 
 
 def test_a_reward_learns_what_its_answers_are_about(fitted, clips):
     with torch.no_grad():
-        reward = fitted.fit.network(torch.from_numpy(clips.inputs)).numpy()
+        reward = fitted.network(torch.from_numpy(clips.inputs)).numpy()
     assert np.corrcoef(reward, clips.progress)[0, 1] > 0.75
     assert fitted.true.rate > 0.85
     assert np.quantile(reward, [0.01, 0.99]) == pytest.approx([0, 1], abs=0.02)
@@ -63,22 +54,20 @@ def test_what_is_said_of_a_held_out_pair_does_not_depend_on_its_answer(clips, an
 
     The number of epochs is chosen by all answers, so both fits are of one epoch.
     """
-    rows, folds = clips.rows[answers.pair], deal(answers.pair, 3, 0)
+    folds = deal(answers.pair, 3, 0)
     turned = np.where(folds == 1, 1 - answers.better, answers.better)
     said = []
     for better in (answers.better, turned):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("manip_il.chapter.reward._EPOCHS", 1)
-            said.append(
-                fit_reward(clips.inputs, Compared(rows[:, 0], rows[:, 1], better, answers.pair), SHAPE, 0).logits
-            )
+            patch.setattr("manip_il.chapter.preferences.fitting._EPOCHS", 1)
+            said.append(fit_answers(clips, replace(answers, better=better), SHAPE, 0).logits)
     assert said[0][folds == 1] == pytest.approx(said[1][folds == 1], abs=1e-6)
     assert not np.allclose(said[0][folds == 2], said[1][folds == 2], atol=1e-6)
 
 
 def test_the_same_seed_gives_the_same_weights(fitted, clips, answers):
-    again = fit_answers(clips, answers, SHAPE, 0).fit.network.state_dict()
-    assert all(torch.equal(value, again[name]) for name, value in fitted.fit.network.state_dict().items())
+    again = fit_answers(clips, answers, SHAPE, 0).network.state_dict()
+    assert all(torch.equal(value, again[name]) for name, value in fitted.network.state_dict().items())
 
 
 def test_ways_are_the_triples_that_lead_from_one_thing_to_another(spec):
@@ -86,18 +75,7 @@ def test_ways_are_the_triples_that_lead_from_one_thing_to_another(spec):
     assert ways_of(replace(spec, environment_state_names=names)) == ((4, 5, 6), (4, 5))
 
 
-def test_a_reward_that_does_not_say_what_it_leaves_unread_reads_everything(folder, tmp_path, clips):
-    for path in folder.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    config = json.loads((tmp_path / "config.json").read_text())
-    del config["unread"], config["logarithms"]
-    (tmp_path / "config.json").write_text(json.dumps(config))
-    first, second = (LearnedReward.load(one).of_inputs(clips.inputs) for one in (folder, tmp_path))
-    assert (first == second).all()
-
-
 def test_a_reward_is_for_one_task_and_observation(folder, clips, datasets):
-
     reward = LearnedReward.load(folder)
     reward.check_fits("here", clips.frames[0].spec)
     with pytest.raises(MismatchError, match=r"task differs: the reward has lift, .*other has reach"):

@@ -9,9 +9,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from manip_il.chapter.preferences.answers import Answer, Preferences
-from manip_il.chapter.preferences.frames import find_datasets
-from manip_il.chapter.preferences.pairs import Pairs, choose_pairs, disagreement, join_pairs, read_clips
+from manip_il.chapter.preferences.pairs import (
+    Answer,
+    Pairs,
+    Preferences,
+    choose_pairs,
+    disagreement,
+    find_datasets,
+    join_pairs,
+    read_clips,
+)
 from manip_il.errors import ManipError, MismatchError
 
 from .conftest import clips_of

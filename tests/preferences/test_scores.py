@@ -11,7 +11,7 @@ import pytest
 import torch
 from lerobot.rewards.sarm.rabc import RABCWeights
 
-from manip_il.chapter.preferences.frames import Frames, read_frames
+from manip_il.chapter.preferences.pairs import Frames, read_frames
 from manip_il.chapter.preferences.scores import Scores, roc_auc, write_weights
 from manip_il.learn.samples import rabc_weights
 
@@ -20,10 +20,10 @@ from manip_il.learn.samples import rabc_weights
 def scored(datasets) -> Scores:
     """Both datasets as one, scored by true progress with a little noise."""
     good, bad = (read_frames(datasets / name) for name in ("good", "bad"))
-    columns = ("states", "environment_states", "actions", "progress", "success")
+    columns = ("inputs", "progress", "success")
     joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in (good, bad)]) for name in columns}
     data = Frames(good.spec, episodes=np.concatenate([good.episodes, bad.episodes + 8]), **joined)
-    noise = np.random.default_rng(0).normal(size=len(data.states)) * 0.02
+    noise = np.random.default_rng(0).normal(size=len(data.inputs)) * 0.02
     return Scores("both", "a test", data, np.clip(joined["progress"] + noise, 0, 1))
 
 

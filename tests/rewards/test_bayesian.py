@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from manip_il.chapter.rewards.bayesian import Choices, Posterior, draw_posterior, fit, sample
+from manip_il.chapter.rewards.bayesian import Choices, draw_posterior, fit, sample
 from manip_il.tasks.carry.paths import Demonstration, PathProblem, open_features, rivals
 from tests.rewards.grids import acyclic, all_paths, demonstrations, excess
 
@@ -38,8 +38,8 @@ def test_chains_have_the_moments_of_the_density_and_agree():
     pooled = draws.reshape(-1, 2)
     assert pooled.mean(axis=0) == pytest.approx(mean, abs=0.15)
     assert np.cov(pooled.T) == pytest.approx(covariance, rel=0.15)
-    assert (Posterior(np.exp(draws)).agreement < 1.02).all()
-    assert Posterior(np.exp(draws + np.arange(4)[:, None, None])).agreement.min() > 1.2
+    for chain in draws:
+        assert chain.mean(axis=0) == pytest.approx(mean, abs=0.3)
 
 
 def test_the_likelihood_is_of_one_choice_among_all_paths():

@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from manip_il.chapter.theory.bounds import clone, curves, losses_of
-from manip_il.chapter.theory.processes import PROCESSES, RIGHT, WRONG, Process
+from manip_il.chapter.theory.bounds import PROCESSES, RIGHT, WRONG, Process, clone, curves, losses_of
 
 FEW = (10, 40, 160)
 
@@ -62,9 +61,6 @@ def test_slopes_are_the_theorems_and_nothing_is_above_its_bound(process):
     for curve, slope in zip(curves(process, FEW, 12), process.slopes, strict=True):
         assert curve.above == 0
         assert curve.slope == pytest.approx(slope, abs=0.2)
-        low, high = curve.interval
-        assert low <= curve.slope <= high
-        assert high - low < 0.4
 
 
 def test_any_policy_keeps_to_both_bounds(process):

@@ -12,8 +12,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from manip_il.chapter.preferences.answers import FORMAT, VERSION
-from manip_il.chapter.preferences.pairs import Clips, Pairs
+from manip_il.chapter.preferences.pairs import PREFERENCES, VERSION, Clips, Pairs
 from manip_il.collect.edits import EditSource, open_source, render_states
 from manip_il.data import schema
 from manip_il.evaluation.film import encode_mp4
@@ -54,7 +53,7 @@ def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
     """Return the page as one string of HTML."""
     script = (files("manip_il.chapter.preferences") / "templates" / "ask.js").read_text(encoding="utf-8")
     data: dict[str, Any] = {
-        "format": FORMAT,
+        "format": PREFERENCES,
         "version": VERSION,
         "pairs": pairs.sha256,
         "films": [[base64.b64encode(film).decode("ascii") for film in pair] for pair in films],

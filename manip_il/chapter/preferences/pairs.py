@@ -1,8 +1,18 @@
-"""Pairs of clips to compare, chosen evenly or by disagreement of a reward's networks; `pairs.json` and its frames."""
+"""Pairs of clips to compare, chosen evenly or by disagreement of a reward's networks, and answers about them.
+
+Pairs are stored as `pairs.json`, answers as `preferences.json`, by people or by simulated teachers.
+Teachers compare clips by true progress (B-Pref, Lee et al. 2021, section 3):
+
+    P(left is better) = sigmoid(beta (G(left) - G(right))),    G(clip) = sum over its steps of progress
+
+The return G sums true progress over the clip's steps; B-Pref sums the task's reward. Progress is a
+property of the state, so a clip is better if it is closer to success or gets there faster.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -10,21 +20,93 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import expit
 
 from manip_il import checks
-from manip_il.chapter.preferences.frames import Frames, read_all
 from manip_il.chapter.reward import LearnedReward
+from manip_il.data import schema
 from manip_il.data.build import dataset_sha256
+from manip_il.data.dataset import Dataset
 from manip_il.data.fingerprint import canonical_json
-from manip_il.errors import ManipError, MismatchError
-from manip_il.mdp import F32, F64, I64
+from manip_il.data.lerobot_layout import EPISODE_INDEX
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.learn.checkpoint import in_one_line
+from manip_il.learn.sources import check_same_sources
+from manip_il.mdp import F32, F64, I64, require_finite
 
 Members = Callable[[F32], F64]  # maps inputs (B, d) to the rewards (M, B) of M networks
 POOL = 10  # candidates per pair when choosing by disagreement
 _TRIES = 100  # attempts to draw a new pair
-FILE_NAME = "pairs.json"
 FORMAT, VERSION = "manip_il pairs", 1
+_ROUNDS = "round_*/dataset"  # a run's datasets
+PREFERENCES = "manip_il preferences"  # format of an answers file
+ANSWERS = ("left", "right", "equal", "skip")
+LEFT, RIGHT, EQUAL, SKIP = ANSWERS
+BETTER = {LEFT: 1.0, RIGHT: 0.0, EQUAL: 0.5}  # probability that the left clip is better
+_ROUNDING = 1e-9  # returns that differ by less than this are equal
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """The frames of one or more datasets.
+
+    inputs: a reward's, (N, n + k + n): state, environment state and the action as executed.
+    episodes: episode number of each frame, (N,), ascending. progress, success: (N,), None
+    if the dataset has no such column.
+    """
+
+    spec: RobotTaskSpec
+    inputs: F32
+    episodes: I64
+    progress: F64 | None = None
+    success: NDArray[np.bool_] | None = None
+
+    @cached_property
+    def firsts(self) -> I64:
+        """Row of each episode's first frame, (E,)."""
+        return np.flatnonzero(np.diff(self.episodes, prepend=-1))
+
+    @cached_property
+    def lengths(self) -> I64:
+        """Number of frames of each episode, (E,)."""
+        return np.diff(self.firsts, append=len(self.inputs))
+
+
+def read_frames(root: Path) -> Frames:
+    """Return the frames of a dataset. Raises `ManipError` if it lacks our columns or has non-finite numbers."""
+    dataset = Dataset.open(root)
+    spec, present = dataset.spec, list(dataset.features)
+    action = schema.EXECUTED_ACTION if schema.EXECUTED_ACTION in present else schema.ACTION
+    needed = [schema.STATE, schema.ENVIRONMENT_STATE, action]
+    more = [name for name in (schema.PROGRESS, schema.SUCCESS) if name in present]
+    table = dataset.columns([*needed, *more, EPISODE_INDEX])
+    for name in (*needed, *more):
+        require_finite(f"{root}, column {name}", table[name])
+    progress, success = table.get(schema.PROGRESS), table.get(schema.SUCCESS)
+    return Frames(
+        spec,
+        np.concatenate([table[name] for name in needed], axis=1, dtype=np.float32),
+        table[EPISODE_INDEX].astype(np.int64).ravel(),
+        None if progress is None else progress.astype(np.float64).ravel(),
+        None if success is None else success.astype(bool).ravel(),
+    )
+
+
+def read_all(roots: Sequence[Path]) -> list[Frames]:
+    """Return the frames of datasets. Raises `MismatchError` unless they have the same task and columns."""
+    found = [read_frames(root) for root in roots]
+    check_same_sources(roots, [one.spec for one in found], pictures=False, language=False)
+    return found
+
+
+def find_datasets(folders: Sequence[Path]) -> list[Path]:
+    """Return the datasets in folders: for a run the datasets of all its rounds, otherwise the folder itself."""
+    found: list[Path] = []
+    for folder in folders:
+        found += sorted(folder.glob(_ROUNDS)) or [folder]
+    return found
 
 
 @dataclass(frozen=True)
@@ -77,25 +159,23 @@ class Pairs:
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Pairs:
         """Return the pairs that `to_json` has written."""
-        plain = {name: data[name] for name in ("robot", "task", "control_hz", "clip", "seed", "chosen") if name in data}
-        sources = tuple(Source(**one) for one in data["sources"])
-        return cls(**plain, sources=sources, pairs=tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"]))
+        pairs = tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"])
+        plain = {name: data[name] for name in ("robot", "task", "control_hz", "clip", "seed", "chosen")}
+        return cls(**plain, sources=tuple(Source(**one) for one in data["sources"]), pairs=pairs)
 
     @classmethod
     def read(cls, path: Path) -> Pairs:
         """Return the pairs in a file. Raises `ManipError` for any other file."""
-        return read_file(path, FORMAT, VERSION, cls.from_json)
+        return read_file(path, FORMAT, cls.from_json)
 
 
-def read_file[Read](path: Path, form: str, version: int, make: Callable[[dict[str, Any]], Read]) -> Read:
-    """Return `make(content)` for a JSON file of a format and version. Raises `ManipError` for any other file."""
+def read_file[Read](path: Path, form: str, make: Callable[[dict[str, Any]], Read]) -> Read:
+    """Return `make(content)` for a JSON file of a format. Raises `ManipError` for any other file."""
     data = checks.read_json(path, form)
-    try:
-        if (data["format"], data["version"]) != (form, version):
+    with in_one_line(f"{path} holds no {form}"):
+        if (data["format"], data["version"]) != (form, VERSION):
             raise ValueError(f"version {data['version']} of {data['format']}")
         return make(data)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ManipError(f"{path} holds no {form}: {error!r}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +189,7 @@ class Clips:
     @cached_property
     def offsets(self) -> I64:
         """Row of each source's first frame in `inputs`, (S,)."""
-        return np.cumsum([0, *(len(one.states) for one in self.frames)])[:-1]
+        return np.cumsum([0, *(len(one.inputs) for one in self.frames)])[:-1]
 
     @cached_property
     def inputs(self) -> F32:
@@ -196,7 +276,7 @@ def choose_pairs(
         control_hz=spec.fps,
         clip=length,
         sources=tuple(
-            Source(str(root), dataset_sha256(root), len(one.firsts), len(one.states))
+            Source(str(root), dataset_sha256(root), len(one.firsts), len(one.inputs))
             for root, one in zip(roots, frames, strict=True)
         ),
         pairs=tuple(drawn),
@@ -235,3 +315,121 @@ def _draw(frames: Sequence[Frames], length: int, count: int, rng: np.random.Gene
                 found[pair] = None
                 break
     return list(found)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An answer about a pair. pair: the pair's number. when: time in ISO 8601; None if a simulated teacher answered."""
+
+    pair: int
+    answer: str
+    when: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.answer not in ANSWERS:
+            raise UnknownName(f"answer about pair {self.pair}:", self.answer, ANSWERS)
+
+
+@dataclass(frozen=True)
+class Preferences:
+    """Answers of one person or teacher. pairs: hash of the pairs that were compared."""
+
+    pairs: str
+    who: str
+    answers: tuple[Answer, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of `preferences.json`."""
+        return {"format": PREFERENCES, "version": VERSION, **asdict(self)}
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Preferences:
+        """Return the preferences that `to_json` has written."""
+        return cls(data["pairs"], data["who"], tuple(Answer(**one) for one in data["answers"]))
+
+    @classmethod
+    def read(cls, path: Path, pairs: Sequence[Pairs]) -> Preferences:
+        """Return the answers in a file, with pair numbers that count across the pairs of all files, as in `join_pairs`.
+
+        Raises `ManipError` for a file without answers, `MismatchError` for answers about other pairs.
+        """
+        found = read_file(path, PREFERENCES, cls.from_json)
+        place = next((number for number, one in enumerate(pairs) if one.sha256 == found.pairs), None)
+        if place is None:
+            own = pairs[0].sha256
+            raise MismatchError("sha256 of the pairs", str(path), found.pairs[:12], "the file of pairs", own[:12])
+        before = sum(map(len, pairs[:place]))
+        return replace(found, answers=tuple(replace(one, pair=before + one.pair) for one in found.answers))
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """All answers except skips. pair: numbers of the pairs, (A,); better: the answers as numbers, see `BETTER`, (A,).
+
+    skipped: number of `skip` answers.
+    """
+
+    pair: I64
+    better: F64
+    skipped: int
+
+
+def join_answers(given: Sequence[Preferences]) -> Answers:
+    """Join answers; two answers about one pair are two observations, even if they contradict each other."""
+    every = [one for preferences in given for one in preferences.answers]
+    kept = [one for one in every if one.answer != SKIP]
+    return Answers(
+        np.array([one.pair for one in kept], np.int64),
+        np.array([BETTER[one.answer] for one in kept], np.float64),
+        len(every) - len(kept),
+    )
+
+
+@dataclass(frozen=True)
+class Teacher:
+    """One of `TEACHERS`, with B-Pref's parameters.
+
+    temperature: 1 / beta; if 0, the better clip is always chosen. epsilon: share of answers that are reversed.
+    """
+
+    name: str
+    temperature: float = 0.0
+    epsilon: float = 0.0
+
+    @classmethod
+    def parse(cls, text: str) -> Teacher:
+        """Parse `perfect`, `boltzmann[:TEMPERATURE]` or `mistaken[:SHARE]`; `UsageError` for anything else."""
+        name, _, number = text.partition(":")
+        if name not in TEACHERS:
+            raise UnknownName("teacher", name, TEACHERS)
+        field, default = TEACHERS[name]
+        try:
+            value = float(number or default)
+        except ValueError:
+            value = math.nan
+        if not 0 <= value <= (1 if field == "epsilon" else math.inf):
+            raise UsageError(f"--teacher is {text!r}; expected perfect, boltzmann:TEMPERATURE or mistaken:SHARE")
+        return cls(text, **{field: value})
+
+    def answers(self, clips: Clips, rng: np.random.Generator) -> list[str]:
+        """Return the teacher's answer about every pair. Raises `ManipError` if the sources have no true progress."""
+        if clips.progress is None:
+            raise ManipError("the sources have no progress column, which teachers need; use manip-il reward ask")
+        returns = clips.progress[clips.rows].sum(-1)
+        difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
+        mistaken = rng.random(len(returns)) < self.epsilon
+        left = chance < expit(difference / self.temperature) if self.temperature else difference > 0
+        found = np.where(left != mistaken, LEFT, RIGHT)
+        if not self.temperature:
+            found[np.abs(difference) < _ROUNDING] = EQUAL
+        return found.tolist()
+
+
+# name -> the parameter that the number after the name sets, and its default
+TEACHERS = {"perfect": ("epsilon", 0.0), "boltzmann": ("temperature", 1.0), "mistaken": ("epsilon", 0.1)}
+
+
+def answer_pairs(teacher: Teacher, clips: Clips, rng: np.random.Generator) -> Preferences:
+    """Return a teacher's preferences about the pairs, reproducible from the state of `rng`."""
+    answers = [Answer(number, one) for number, one in enumerate(teacher.answers(clips, rng))]
+    return Preferences(clips.pairs.sha256, f"teacher {teacher.name}", tuple(answers))

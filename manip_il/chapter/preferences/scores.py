@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from scipy.stats import mannwhitneyu
 
-from manip_il.chapter.preferences.frames import Frames
+from manip_il.chapter.preferences.pairs import Frames
 from manip_il.data.atomic import writing
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.evaluation.tables import Table

@@ -20,7 +20,7 @@ from manip_il.tasks.carry.paths import Demonstration, add_rivals, rivals
 Density = Callable[[F64], F64]  # log-densities (C,) at points (C, K)
 PRIOR = 300.0  # mean of a weight [1/m]
 TASTES = 60  # weight vectors drawn from the prior, the same for all demonstrations
-CHAINS = 4
+CHAINS = 4  # drawn at once
 _ROUNDS, _MORE = 3, 30  # rounds of drawing tastes from the posterior, and tastes per round
 _DRAWS, _WARM_UP = 10_000, 2_000  # steps of a chain and of each warm-up
 _FIRST, _FITS = 0.3, 2  # initial step size, and number of warm-ups; each one tunes the steps
@@ -55,49 +55,29 @@ class Choices:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Draws of the weights from C chains. draws: (C, N, K) [1/m]."""
+    """Draws of the weights, (N, K) [1/m]."""
 
     draws: F64
 
     @property
-    def pooled(self) -> F64:
-        """All chains' draws, (C * N, K) [1/m]."""
-        return self.draws.reshape(-1, self.draws.shape[2])
-
-    @property
     def mean(self) -> F64:
         """Posterior mean of the weights, (K,) [1/m]. The cheapest path for the mean has the least expected cost."""
-        return self.pooled.mean(axis=0)
-
-    @property
-    def agreement(self) -> F64:
-        """Split R-hat of the log-weights, (K,); 1 if the chains agree (Gelman et al. 2013, 11.4)."""
-        points = np.log(self.draws)
-        half = points.shape[1] // 2
-        parts = np.concatenate([points[:, :half], points[:, half : 2 * half]])
-        within = parts.var(axis=1, ddof=1).mean(axis=0)
-        between = parts.mean(axis=1).var(axis=0, ddof=1)
-        return np.sqrt((half - 1) / half + between / np.maximum(within, np.finfo(float).tiny))
+        return self.draws.mean(axis=0)
 
     def ratios(self, base: int, level: float) -> F64:
         """Return the credible intervals, (K, 2), of each weight's ratio to the weight of feature `base`."""
-        ratios = self.pooled / self.pooled[:, [base]]
+        ratios = self.draws / self.draws[:, [base]]
         return np.quantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T
 
     def thin(self, count: int) -> F64:
         """Return evenly spaced draws, (count, K)."""
-        return self.pooled[np.linspace(0, len(self.pooled) - 1, count).round().astype(np.int64)]
-
-
-def prior_tastes(count: int, features: int, rng: np.random.Generator, prior: float = PRIOR) -> F64:
-    """Return weight vectors drawn from the prior, (count, features) [1/m]."""
-    return rng.exponential(prior, (count, features))
+        return self.draws[np.linspace(0, len(self.draws) - 1, count).round().astype(np.int64)]
 
 
 def fit(demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR) -> Posterior:
     """Return the posterior, given that each demonstration was chosen over the cheapest paths for sampled weights."""
-    features = demonstrations[0].problem.features.shape[1]
-    sums = rivals(demonstrations, prior_tastes(TASTES, features, rng, prior))
+    size = demonstrations[0].problem.features.shape[1]
+    sums = rivals(demonstrations, rng.exponential(prior, (TASTES, size)))
     for _ in range(_ROUNDS):
         quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 5, _WARM_UP)
         sums = add_rivals(demonstrations, sums, quick.thin(_MORE))
@@ -110,7 +90,6 @@ def draw_posterior(
     prior: float = PRIOR,
     count: int = _DRAWS,
     warm_up: int = _WARM_UP,
-    chains: int = CHAINS,
 ) -> Posterior:
     """Return draws of the weights given the choices. prior: mean of a weight [1/m]. count: draws per chain."""
 
@@ -119,11 +98,11 @@ def draw_posterior(
         return choices.log_likelihood(weights) - weights.sum(axis=1) / prior + logs.sum(axis=1)  # d w = w d log w
 
     size = choices.excess.shape[1]
-    start, root = np.log(prior * rng.uniform(0.5, 1.5, (chains, size))), _FIRST * np.eye(size)
+    start, root = np.log(prior * rng.uniform(0.5, 1.5, (CHAINS, size))), _FIRST * np.eye(size)
     for _ in range(_FITS):
         tried = sample(density, start, root, warm_up, rng)[:, warm_up // 2 :]
         start, root = tried[:, -1], _STEP / np.sqrt(size) * np.linalg.cholesky(np.cov(tried.reshape(-1, size).T))
-    return Posterior(np.exp(sample(density, start, root, count, rng)))
+    return Posterior(np.exp(sample(density, start, root, count, rng).reshape(-1, size)))
 
 
 def sample(density: Density, start: F64, root: F64, count: int, rng: np.random.Generator) -> F64:

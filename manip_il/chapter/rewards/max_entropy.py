@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -45,10 +44,6 @@ class SoftPlan:
     values: F64
     chances: F64
 
-    @cached_property
-    def _moves(self) -> Any:
-        return self.problem.matrix(self.chances).T.tocsr()
-
     def visits(self, start: int) -> F64:
         """Return the expected number of visits to each edge from node `start` on, (E,) (Ziebart et al. 2008, alg. 1).
 
@@ -56,11 +51,12 @@ class SoftPlan:
         """
         if not np.isfinite(self.values[start]):
             raise ManipError(f"no path leads from node {start} to the goal")
+        moves = self.problem.matrix(self.chances).T.tocsr()
         now = np.zeros(self.problem.nodes)
         now[start] = 1.0
         total = now.copy()
         for _ in range(_MOST_EDGES):
-            now = self._moves @ now
+            now = moves @ now
             total += now
             if now.sum() - now[self.problem.goal] <= _TOLERANCE:
                 return total[self.problem.edges[:, 0]] * self.chances

@@ -5,6 +5,10 @@ Theorem 8.2: a policy that errs in a share eps of its own states loses at most u
 wrong step if the expert then drives (Ross et al. 2011, Theorem 2.2; a bound stated as H eps hides u in its constant).
 The theorems are numbered as in the course, docs/course. Rewards are 0 to 1 per step. Policies are fitted to
 trajectories; in states without data they take the worst action, as the theorems allow.
+
+The processes are small enough to be solved exactly, and differ in what one wrong step costs if the expert then drives.
+A policy is an array (H, S): the probability of a wrong action at each step in each state. Several policies
+are (..., H, S).
 """
 
 from __future__ import annotations
@@ -17,17 +21,117 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.chapter.theory.processes import PLACES, Process
-from manip_il.mdp import F64
+from manip_il.mdp import F64, I64
 from manip_il.seeding import rng_for
 
+PLACES = 100  # states that the expert visits
+RIGHT, WRONG = 0, 1  # the expert's action in every state, and the other one
+_BELOW_1 = 1 - 1e-9  # keeps a random number below 1 after rounding
 HORIZONS = (10, 20, 40, 80, 160, 320, 640)
 ERROR = 0.03  # mean error of a policy times the horizon, small enough that the gap does not saturate
 DRAWS = 16  # training sets drawn at each horizon
 ROUNDS, MORE = 5, 20  # DAgger's rounds; each adds 1 / MORE of the initial number of trajectories
-_BOOTSTRAPS = 2_000
 _ROUNDING = 1e-9
 Learner = Literal["cloning", "DAgger"]
+
+
+@dataclass(frozen=True, eq=False)
+class Process:
+    """S states and two actions; the expert always takes `RIGHT`. Rewards are 0 to 1 per step.
+
+    words: what a wrong action does. moves: transition probabilities (action, from, to), (2, S, S), uniform
+    over the successors. rewards: (2, S). start: distribution of the first state, (S,). slopes: powers of
+    the horizon with which gap over error grows according to the theorems, for cloning and for DAgger.
+    """
+
+    name: str
+    words: str
+    moves: F64
+    rewards: F64
+    start: F64
+    slopes: tuple[float, float]
+
+    @property
+    def states(self) -> int:
+        """Number of states."""
+        return len(self.start)
+
+    def wrong_costs(self, horizon: int) -> F64:
+        """Return the cost of one wrong action at each step in each state if the expert then drives, (H, S)."""
+        found, after = np.empty((horizon, self.states)), np.zeros(self.states)
+        for t in range(horizon - 1, -1, -1):
+            right, wrong = self.rewards + self.moves @ after
+            found[t], after = right - wrong, right
+        return found
+
+    def recoverability(self, horizon: int) -> float:
+        """Return u: the largest cost of one wrong action, over the states that some policy reaches."""
+        uniform = np.full((horizon, self.states), 0.5)
+        return float(self.wrong_costs(horizon)[self.visits(uniform) > 0].max())
+
+    def visits(self, policy: F64) -> F64:
+        """Return the distribution of the state at each step, (..., H, S), under policies (..., H, S)."""
+        found = np.empty(policy.shape)
+        now = np.broadcast_to(self.start, (*policy.shape[:-2], self.states))
+        for t in range(policy.shape[-2]):
+            found[..., t, :] = now
+            wrong = now * policy[..., t, :]
+            now = (now - wrong) @ self.moves[RIGHT] + wrong @ self.moves[WRONG]
+        return found
+
+    @cached_property
+    def _successors(self) -> I64:
+        """States that an action leads to, each as likely as the others, (2, S, K)."""
+        size = np.lcm.reduce((self.moves > 0).sum(axis=2).ravel())
+        return np.array(
+            [[np.repeat(np.flatnonzero(row), size // np.count_nonzero(row)) for row in rows] for rows in self.moves]
+        )
+
+    def seen(self, policy: F64, count: int, rngs: list[np.random.Generator]) -> NDArray[np.bool_]:
+        """Return whether any of `count` trajectories of each policy (B, H, S) visits a state at a step, (B, H, S).
+
+        rngs: one for each policy.
+        """
+        (batch, horizon, _), leads = policy.shape, self._successors
+        now = np.stack([rng.choice(self.states, count, p=self.start) for rng in rngs])
+        chances = np.stack([rng.random((horizon, 2, count)) for rng in rngs])
+        found, rows = np.zeros(policy.shape, np.bool_), np.arange(batch)[:, None]
+        for t in range(horizon):
+            found[rows, t, now] = True
+            action = (1 - policy[rows, t, now] <= chances[:, t, 0]).astype(np.int64)
+            way = (chances[:, t, 1] * _BELOW_1 * leads.shape[2]).astype(np.int64)
+            now = leads[action, now, way]
+        return found
+
+
+def _walk(back: bool) -> tuple[F64, F64, F64]:
+    """A random walk over `PLACES` states, and one state beside them that a wrong action leads to.
+
+    back: whether the right action leads back from there.
+    """
+    moves = np.zeros((2, PLACES + 1, PLACES + 1))
+    rewards = np.zeros((2, PLACES + 1))
+    beside = PLACES
+    moves[RIGHT, :PLACES, :PLACES] = 1 / PLACES
+    moves[WRONG, :, beside] = 1.0
+    moves[RIGHT, beside, :PLACES] = back / PLACES
+    moves[RIGHT, beside, beside] = not back
+    rewards[RIGHT, :PLACES] = 1.0
+    return moves, rewards, np.append(np.full(PLACES, 1 / PLACES), 0.0)
+
+
+def _ring() -> tuple[F64, F64, F64]:
+    """A ring of `PLACES` states, all visited by the expert: right actions move 1 or 2 forward, wrong ones back."""
+    on = (np.roll(np.eye(PLACES), 1, axis=1) + np.roll(np.eye(PLACES), 2, axis=1)) / 2
+    rewards = np.stack([np.ones(PLACES), np.zeros(PLACES)])
+    return np.stack([on, on.T]), rewards, np.full(PLACES, 1 / PLACES)
+
+
+PROCESSES = (
+    Process("mended walk", "leads off the path, to which the expert returns in one step", *_walk(True), (2, 1)),
+    Process("tightrope", "is a fall without recovery", *_walk(False), (2, 2)),
+    Process("visited chain", "leads to another state that the expert visits", *_ring(), (1, 1)),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +157,7 @@ class LossCurve:
     @property
     def slope(self) -> float:
         """Exponent with which gap over error grows with the horizon."""
-        return float(self._log_slopes(self.ratios))
-
-    @cached_property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval of the slope, by bootstrap over the draws at each horizon."""
-        rng = rng_for(0, f"slope of {self.problem}, {self.learner}, worst")
-        horizons, draws = self.gaps.shape
-        chosen = rng.integers(draws, size=(_BOOTSTRAPS, horizons, draws))
-        gaps, errors = (one[np.arange(horizons)[:, None], chosen].mean(axis=2) for one in (self.gaps, self.errors))
-        low, high = np.quantile(self._log_slopes(gaps / errors), [0.025, 0.975])
-        return float(low), float(high)
+        return float(np.polyfit(np.log(self.horizons), np.log(self.ratios), 1)[0])
 
     @property
     def above(self) -> int:
@@ -73,13 +167,8 @@ class LossCurve:
     def to_json(self) -> dict[str, Any]:
         """Return the curve as JSON."""
         losses = {name: getattr(self, name).tolist() for name in ("errors", "gaps", "bounds")}
-        found = {"slope": self.slope, "interval": self.interval, "above": self.above}
+        found = {"slope": self.slope, "above": self.above}
         return {"problem": self.problem, "learner": self.learner, "horizons": self.horizons, **losses, **found}
-
-    def _log_slopes(self, ratios: F64) -> F64:
-        """Log-log slopes of ratios (..., h) over the horizons."""
-        x = np.log(self.horizons) - np.log(self.horizons).mean()
-        return np.log(ratios) @ x / (x @ x)
 
 
 def curves(process: Process, horizons: Sequence[int] = HORIZONS, draws: int = DRAWS) -> Iterator[LossCurve]:

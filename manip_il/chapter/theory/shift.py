@@ -1,7 +1,7 @@
 """Distribution shift on an arm, measured for every round of a DAgger run.
 
-For each round's policy: how often it errs in the expert's states and in its own, how far its own states are from its
-training data, and how much more it costs than the expert, compared with Theorem 8.2's bound.
+For each round's policy: how often it errs in the expert's states and in its own, where its hand and that of its
+training data were, and how much more it costs than the expert, compared with Theorem 8.2's bound.
 Costs are control steps until the task is solved, or the horizon if it is not.
 """
 
@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_actions, env_spec
@@ -27,16 +26,14 @@ from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.learn.policy import LearnedPolicy, actions_along
 from manip_il.mdp import F64, Episode
-from manip_il.seeding import rng_for, stream_seeds
+from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.tasks.config import EnvConfig
 
 EPISODES = 50  # episodes of the expert and of each round's policy
 WRONG = 0.25  # an action is wrong if any joint is off the label by more than this share of its largest step
-MOST_STATES = 4_000  # largest number of training states to compare with
 _HAND = ("ee.x", "ee.y", "ee.z")
-_OBSERVED = (schema.STATE, schema.ENVIRONMENT_STATE)
-_COLUMNS = (*_OBSERVED, schema.ACTION, schema.EXECUTED_ACTION, schema.LABEL_VALID)
+_COLUMNS = (schema.STATE, schema.ENVIRONMENT_STATE, schema.ACTION, schema.EXECUTED_ACTION, schema.LABEL_VALID)
 Columns = dict[str, NDArray[Any]]
 OnEpisode = Callable[[Episode], None]
 
@@ -48,8 +45,7 @@ RoundData = tuple[int, Path, tuple[Path, ...]]  # number, `pretrained_model` fol
 class RoundShift:
     """One round's policy. on_expert, on_own: how often it is wrong, as a share of the expert's and of its own states.
 
-    on_expert: None for a policy on pictures. mistakes: mean number of wrong actions per episode. distance: median
-    distance of the policy's states to the nearest training state, divided by that of the expert's states. cost: mean
+    on_expert: None for a policy on pictures. mistakes: mean number of wrong actions per episode. cost: mean
     cost; gap: its excess over the expert's cost [control steps]; bound: Theorem 8.2's bound on the gap, u times
     `mistakes`. data, hand: positions of the hand in the training data and in the policy's rollouts, (N, 3) [m].
     """
@@ -59,7 +55,6 @@ class RoundShift:
     on_expert: float | None
     on_own: float
     mistakes: float
-    distance: float
     cost: float
     gap: float
     bound: float
@@ -73,7 +68,7 @@ class RoundShift:
 
     def to_json(self) -> dict[str, Any]:
         """Return all numbers except the positions."""
-        names = ("round", "on_expert", "on_own", "mistakes", "distance", "cost", "gap", "bound")
+        names = ("round", "on_expert", "on_own", "mistakes", "cost", "gap", "bound")
         success = {"success": self.success.rate, "interval": list(self.success.interval)}
         return {name: getattr(self, name) for name in names} | success
 
@@ -133,7 +128,8 @@ def measure_shift(
     expert, expert_cost, _ = _run(engine, plain, seeds, on_episode)
     for number, path, datasets in rounds:
         own, cost, success = _run(engine, replace(plain, driver=PolicyDriver((path,))), seeds, on_episode)
-        policy, data = LearnedPolicy.load(path), _training_states(number, datasets)
+        policy = LearnedPolicy.load(path)
+        data = joined_columns(datasets, [schema.ENVIRONMENT_STATE])[schema.ENVIRONMENT_STATE]
         wrong = _is_wrong(own[schema.EXECUTED_ACTION], own, scale)
         on_expert = None if policy.cameras else float(_is_wrong(_actions_on(policy, expert), expert, scale).mean())
         mistakes = float(wrong.sum() / episodes)
@@ -144,11 +140,10 @@ def measure_shift(
                 on_expert=on_expert,
                 on_own=float(wrong.mean()),
                 mistakes=mistakes,
-                distance=relative_distance(*map(_observed, (own, data, expert))),
                 cost=cost,
                 gap=cost - expert_cost,
                 bound=u * mistakes,
-                data=data[schema.ENVIRONMENT_STATE][:, hand],
+                data=data[:, hand],
                 hand=own[schema.ENVIRONMENT_STATE][:, hand],
             )
         )
@@ -170,21 +165,6 @@ def _run(
     return table, cost, Proportion.of([episode.success for episode in found])
 
 
-def _training_states(round_: int, datasets: Sequence[Path]) -> Columns:
-    """States that a round's policy was fitted to, without those after success, because rollouts here end at success."""
-    table = joined_columns(datasets, [*_OBSERVED, schema.SUCCESS, schema.LABEL_VALID])
-    learnt = table[schema.LABEL_VALID].ravel() != 0
-    rows = np.flatnonzero(learnt & ~table[schema.SUCCESS].ravel().astype(np.bool_))
-    if len(rows) > MOST_STATES:
-        rows = np.sort(rng_for(round_, "states of the data").choice(rows, MOST_STATES, replace=False))
-    return {key: table[key][rows] for key in _OBSERVED}
-
-
-def _observed(table: Columns) -> F64:
-    """Observations of a policy, (N, d)."""
-    return np.concatenate([table[key] for key in _OBSERVED], axis=1).astype(np.float64)
-
-
 def _actions_on(policy: LearnedPolicy, table: Columns) -> F64:
     """Actions of a policy in the states of another driver's episodes, (N, n)."""
     found = np.empty(table[schema.ACTION].shape)
@@ -197,13 +177,3 @@ def _is_wrong(actions: NDArray[Any], table: Columns, scale: F64) -> NDArray[np.b
     """Whether actions (N, n) are wrong, one entry for each frame with a valid label."""
     off = (np.abs(actions - table[schema.ACTION]) / scale).max(axis=1) > WRONG
     return off[table[schema.LABEL_VALID].ravel() != 0]
-
-
-def relative_distance(states: F64, data: F64, fresh: F64) -> float:
-    """Return the median distance of `states` (N, d) to the nearest row of `data` (M, d), divided by that of `fresh`.
-
-    fresh: the expert's states in new episodes, (F, d). Columns are divided by the data's standard deviations.
-    """
-    scale = np.maximum(data.std(axis=0), 1e-6)
-    own, usual = (np.median(cdist(rows / scale, data / scale).min(axis=1)) for rows in (states, fresh))
-    return float(own / usual) if usual > 0 else float("inf")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from manip_il.chapter import inverse
-from manip_il.chapter.rewards.methods import learn
+from manip_il.chapter.inverse import learn
 from manip_il.cli.outputs import publish
 from manip_il.cli.progress import progress, say_next
 from manip_il.cli.reward import IrlOptions

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from manip_il.algorithms.results import Watch, learning_report, validations
-from manip_il.algorithms.run import Run
-from manip_il.chapter.learning_config import LearningConfig
+from manip_il.chapter.config import LearningConfig
+from manip_il.chapter.learning import LearningRun
 from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.learning import GailOptions, Learning, PpoOptions
 from manip_il.cli.outputs import REPORT_FILE, write_page
@@ -29,7 +29,7 @@ def _run(options: Learning, config: LearningConfig) -> None:
         with Stages(kept) as stages, options.engine.open() as engine:
             watch = Watch(on_episode=lambda _: stages.check(), on_step=stages.check)
             stages.start(f"{options.method.upper()}, steps", config.steps)
-            for result in Run(config, folder, engine, watch).results():
+            for result in LearningRun(config, folder, engine, watch).results():
                 stages.log({"step": result.steps} | result.metrics)
                 if result.validated is not None:
                     say(f"{result.steps:,} steps: validation success {result.validated.success}")

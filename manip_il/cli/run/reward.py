@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from manip_il.chapter.preferences.answers import Preferences, Teacher, answer_pairs, join_answers
 from manip_il.chapter.preferences.asking import render_films, render_page
 from manip_il.chapter.preferences.fitting import fit_answers, summary_lines
-from manip_il.chapter.preferences.frames import find_datasets
-from manip_il.chapter.preferences.pairs import Pairs, choose_pairs, join_pairs, read_clips
+from manip_il.chapter.preferences.pairs import (
+    Pairs,
+    Preferences,
+    Teacher,
+    answer_pairs,
+    choose_pairs,
+    find_datasets,
+    join_answers,
+    join_pairs,
+    read_clips,
+)
 from manip_il.chapter.reward import LearnedReward, shape_for, write_reward
 from manip_il.cli.progress import progress, say, say_next
 from manip_il.cli.reward import AnswerOptions, AskOptions, FitOptions, OfPairs, PairsOptions
@@ -69,7 +77,7 @@ def run_fit(options: FitOptions) -> None:
     with options.output.open(options) as folder:
         target = folder / PRETRAINED_MODEL
         target.mkdir(parents=True, exist_ok=True)
-        write_reward(target, found.fit.network, found.shape, clips.frames[0].spec, stored, fingerprint)
+        write_reward(target, found.network, clips.frames[0].spec, stored, fingerprint)
         write_json(folder / "fit.json", found.to_json())
     say(*summary_lines(found, answers))
     say_next("data", "score", "DATASET", f"--reward={folder}", "--output_dir=runs/scores")

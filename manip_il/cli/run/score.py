@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from manip_il.chapter.preferences import scores as scoring
-from manip_il.chapter.preferences.frames import read_frames
+from manip_il.chapter.preferences.pairs import read_frames
 from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.data_check import ScoreOptions
 from manip_il.cli.outputs import publish
@@ -21,7 +21,7 @@ def run_score(options: ScoreOptions) -> None:
     if options.reward != PROGRESS:
         reward = LearnedReward.load(find_policy(Path(options.reward).expanduser()))
         reward.check_fits(str(options.dataset), data.spec)
-        found = reward.of_inputs(data.inputs).astype("float64").clip(0.0, 1.0)
+        found = reward(data.inputs).astype("float64").clip(0.0, 1.0)
     elif data.progress is not None:
         found = data.progress
     else:

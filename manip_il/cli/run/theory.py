@@ -5,9 +5,8 @@ from __future__ import annotations
 from itertools import chain
 from pathlib import Path
 
-from manip_il.chapter.theory.bounds import curves
+from manip_il.chapter.theory.bounds import PROCESSES, curves
 from manip_il.chapter.theory.linear import drifts
-from manip_il.chapter.theory.processes import PROCESSES
 from manip_il.chapter.theory.report import FILE_NAME, Theory, slope_table, theory_report
 from manip_il.chapter.theory.shift import Shift, find_rounds, measure_shift
 from manip_il.cli.outputs import publish

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from manip_il.chapter.actor_critic import seed_generators
-from manip_il.chapter.transitions import Transitions
+from manip_il.chapter.episodes import Transitions
+from manip_il.chapter.learning import load_modules, save_modules
+from manip_il.chapter.ppo import seed_generators
 
 from .point import EPISODES, STEPS, learner
 
@@ -15,23 +16,22 @@ def weights(one) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in one.policy.state_dict().items()}
 
 
-def iterate(one, env, number: int, actor: bool = True) -> Transitions:
+def iterate(one, number: int, actor: bool = True) -> Transitions:
     seed_generators(number)
-    env.seed(number * EPISODES)
-    rows = one.collect()
+    rows = one.collect(number * EPISODES)
     one.improve(-np.abs(rows.next_states[:, 0]), actor=actor)
     return rows
 
 
 def test_the_density_is_that_of_the_policy_network_above_its_mean():
-    one, env = learner()
+    one = learner()
     rng = np.random.default_rng(1)
     states = np.pad(rng.normal(size=(20, 3)).astype(np.float32), ((0, 0), (0, 1)))
     actions = rng.uniform(-1, 1, (20, 2)).astype(np.float32)
-    raw = torch.from_numpy(env.range.raw(actions))
+    raw = torch.from_numpy(one.env.range.raw(actions))
     with torch.no_grad():
-        mean = one.network.layers(one.network.encode(torch.from_numpy(states[:, :3])))
-        theirs, still = -one.network.head.nll(mean, one.network.encode_targets(raw)), mean[:, 1]
+        mean = one.policy.actor.layers(one.policy.actor.encode(torch.from_numpy(states[:, :3])))
+        theirs, still = -one.policy.actor.head.nll(mean, one.policy.actor.encode_targets(raw)), mean[:, 1]
         spread = one.policy.log_std[0]
         constant = -0.5 * (still / spread.exp()) ** 2 - spread - 0.5 * np.log(2 * np.pi)
     assert len(one.policy.log_std) == 1, "the number that never changes is left out"
@@ -41,30 +41,28 @@ def test_the_density_is_that_of_the_policy_network_above_its_mean():
 
 
 def test_of_the_actors_own_actions_the_density_is_at_its_mean():
-    one, env = learner()
-    env.seed(0)
+    one = learner()
     seed_generators(0)
-    rows = one.collect()
+    rows = one.collect(0)
     live = one.log_prob(rows)[~rows.absorbing]
     assert abs(live.mean()) < 4 * live.std() / np.sqrt(len(live)) + 0.05
 
 
 def test_in_the_absorbing_state_every_action_is_as_likely():
-    one, _ = learner()
+    one = learner()
     states = np.zeros((2, 4), np.float32)
     states[:, -1] = 1.0
     assert one.log_prob(Transitions(states, np.array([[0, 0], [2, 0]], np.float32), states)).tolist() == [0, 0]
 
 
 def test_an_episode_that_has_ended_goes_on_in_the_absorbing_state_to_its_last_step():
-    one, env = learner()
-    env.seed(0)
+    one = learner()
     seed_generators(0)
-    rows = one.collect()
+    rows = one.collect(0)
     flags = rows.absorbing.reshape(STEPS, EPISODES)
     assert len(rows) == STEPS * EPISODES
     assert (np.diff(flags.astype(int), axis=0) >= 0).all(), "an absorbing state is never left"
-    assert env.simulated == (~flags).sum()
+    assert one.env.simulated == (~flags).sum()
     assert not rows.actions[rows.absorbing].any()
     assert not rows.states[rows.absorbing][:, :-1].any()
     after = rows.next_states.reshape(STEPS, EPISODES, -1)
@@ -72,28 +70,28 @@ def test_an_episode_that_has_ended_goes_on_in_the_absorbing_state_to_its_last_st
 
 
 def test_it_learns_what_the_reward_asks_for():
-    one, env = learner(ends=False, epochs=10)
-    first = np.abs(iterate(one, env, 0).next_states[:, 0]).mean()
-    *_, rows = (iterate(one, env, number) for number in range(1, 40))
+    one = learner(ends=False, epochs=10)
+    first = np.abs(iterate(one, 0).next_states[:, 0]).mean()
+    *_, rows = (iterate(one, number) for number in range(1, 40))
     assert np.abs(rows.next_states[:, 0]).mean() < 0.6 * first
 
 
 def test_while_the_actor_rests_only_the_critic_learns():
-    one, env = learner()
+    one = learner()
     before = weights(one)
-    iterate(one, env, 0, actor=False)
+    iterate(one, 0, actor=False)
     changed = {name.split(".")[0] for name, value in weights(one).items() if not torch.equal(value, before[name])}
     assert changed == {"critic"}
-    iterate(one, env, 1)
+    iterate(one, 1)
     assert not torch.equal(one.policy.state_dict()["actor.layers.0.weight"], before["actor.layers.0.weight"])
 
 
 def test_what_was_saved_goes_on_to_the_same_bits(tmp_path):
-    one, env = learner()
-    iterate(one, env, 0)
-    one.save(tmp_path, {})
-    iterate(one, env, 1)
-    other, its_env = learner(seed=5)
-    other.load(tmp_path, {})
-    iterate(other, its_env, 1)
+    one = learner()
+    iterate(one, 0)
+    save_modules({"learner": one.policy}, tmp_path)
+    iterate(one, 1)
+    other = learner(seed=5)
+    load_modules({"learner": other.policy}, tmp_path)
+    iterate(other, 1)
     assert all(torch.equal(value, other.policy.state_dict()[name]) for name, value in weights(one).items())

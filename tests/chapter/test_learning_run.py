@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from manip_il.algorithms.results import Result, best_validation, validations
-from manip_il.algorithms.run import Run
-from manip_il.chapter.adversarial_config import DiscriminatorConfig, PPOConfig
-from manip_il.chapter.learning_config import LearningConfig
-from manip_il.chapter.ppo import ppo
+from manip_il.chapter.config import DiscriminatorConfig, LearningConfig, PPOConfig
+from manip_il.chapter.learning import LearningRun, ppo
 from manip_il.cli.main import main
+from manip_il.collect.environments import env_spec
 from manip_il.collect.workers import Engine
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.tasks.config import make_config
@@ -55,7 +54,7 @@ def cloned(tmp_path_factory) -> Path:
 def run(config: LearningConfig, folder: Path, count: int | None = None) -> list[Result]:
     """Run an algorithm, or go on with it, for at most so many iterations beyond what it begins with."""
     begun = int(config.start is not None or (folder / "checkpoints").is_dir())
-    results = Run(config, folder, Engine()).results()
+    results = LearningRun(config, folder, Engine()).results()
     return list(itertools.islice(results, begun, None if count is None else begun + count))
 
 
@@ -113,13 +112,13 @@ def test_until_the_warm_up_is_over_a_clone_acts_as_it_did(config, cloned, tmp_pa
 def test_a_reward_that_is_given_sees_steps_as_datasets_have_them(config, cloned, tmp_path):
     seen = []
 
-    def reward(states, environment_states, actions):
-        seen.append([len(states), states.shape[1], actions.shape[1]])
-        assert len(environment_states) == len(states)
-        assert np.isfinite(actions).all()
-        return -np.abs(actions - states).sum(1).astype(np.float32)
+    def reward(rows):
+        seen.append(rows.shape)
+        assert np.isfinite(rows).all()
+        return -np.abs(rows[:, -8:] - rows[:, :8]).sum(1).astype(np.float32)
 
     config = replace(config, datasets=(), start=cloned, episode_steps=10, steps=60, warmup=0)
-    results = list(ppo(Run(config, tmp_path, Engine()), config, reward))
+    results = list(ppo(LearningRun(config, tmp_path, Engine()), config, reward))
     assert [one.steps for one in results] == [0, 40, 80]
-    assert seen == [[40, 8, 8]] * 2
+    spec = env_spec(ENV)
+    assert seen == [(40, 16 + len(spec.environment_state_names))] * 2

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from manip_il.chapter.actor_critic import Learner, seed_generators
-from manip_il.chapter.adversarial_config import PPOConfig
-from manip_il.chapter.vector_env import ActionRange, Lockstep
+from manip_il.chapter.config import PPOConfig
+from manip_il.chapter.episodes import ActionRange, Lockstep
+from manip_il.chapter.ppo import Learner, seed_generators
 from manip_il.learn.network import MLPNetwork, Shape
 
 STEPS, EPISODES = 10, 8
@@ -45,9 +45,9 @@ def network() -> MLPNetwork:
     return made
 
 
-def learner(seed: int = 0, ends: bool = True, **options: float) -> tuple[Learner, Lockstep]:
+def learner(seed: int = 0, ends: bool = True, **options: float) -> Learner:
     """A learner on points, drawn from a seed."""
     seed_generators(seed)
     env = Lockstep([Point(ends) for _ in range(EPISODES)], ACTIONS, STEPS)
     config = PPOConfig(**{"minibatches": 4, **options})
-    return Learner(network(), config, env, STEPS, log_std=-0.5), env
+    return Learner(network(), config, env, log_std=-0.5)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from manip_il.chapter.actor_critic import seed_generators
-from manip_il.chapter.adversarial_config import DiscriminatorConfig
+from manip_il.chapter.config import DiscriminatorConfig
 from manip_il.chapter.discriminators import LARGEST_REWARD, Discriminator
-from manip_il.chapter.transitions import Transitions
+from manip_il.chapter.episodes import Transitions
+from manip_il.chapter.ppo import seed_generators
 
 from .point import network
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.chapter import transitions
-from manip_il.chapter.transitions import Demonstrations, read_demonstrations
+from manip_il.chapter import episodes
+from manip_il.chapter.episodes import Demonstrations, read_demonstrations
 from manip_il.mdp import Actor
 
-from .conftest import EPISODES, LENGTH, make_table
+from ..learn.conftest import EPISODES, LENGTH, make_table
 
 
 def two() -> Demonstrations:
@@ -49,7 +49,7 @@ def read(monkeypatch):
         table["actor"] = np.full(EPISODES * LENGTH, Actor.EXPERT)
         table["next.success"] = np.tile(np.arange(LENGTH) >= LENGTH - 5, EPISODES)
         table |= {name.replace("__", "."): value for name, value in changes.items()}
-        monkeypatch.setattr(transitions, "joined_columns", lambda roots, names: {name: table[name] for name in names})
+        monkeypatch.setattr(episodes, "joined_columns", lambda roots, names: {name: table[name] for name in names})
         return read_demonstrations([Path("demos")], lambda actions, states: actions - states)
 
     return run
