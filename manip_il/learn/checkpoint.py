@@ -33,8 +33,8 @@ PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 MOST_VALUES = 10_000  # in one numeric input of a network, or in its action
 _PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
 _MLP_SHAPE = (  # options that define an mlp's architecture
-    *("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled"),
-    *("grippers", "action_space"),
+    *("width", "depth", "activation", "loss", "components", "bins", "sigma", "clamp", "scales"),
+    *("scaled", "grippers", "action_space"),
 )
 
 
@@ -204,8 +204,7 @@ class Checkpoint:
         """The options for building another mlp of this architecture; None for another kind of policy."""
         if self.kind != MLP:
             return None
-        kept = {name: self.config[name] for name in _MLP_SHAPE if name in self.config}
-        return {"type": MLP, **kept, "sigma": self.config.get("sigma", 0.0)}
+        return {name: self.config[name] for name in ("type", *_MLP_SHAPE)}
 
     def check_fits(self, spec: RobotTaskSpec) -> None:
         """Raise `MismatchError` naming both sides unless environments of `spec` have the policy's inputs and action."""

@@ -27,8 +27,11 @@ from manip_il.learn.fit_config import FitConfig, check_convertible
 from manip_il.learn.names import JOINT_TARGET, OWN_SPACE
 
 PLUGINS = ("manip_il.learn.mlp", "manip_il.learn.cnn")
-# Options of LeRobot's policies that concern its Hub, its commands or one machine: not accepted here.
-NOT_OURS = ("push_to_hub", "repo_id", "private", "pretrained_path", "pretrained_revision", "use_peft")
+# Options of LeRobot's policies that concern its Hub, its commands or one machine, and one without effect.
+NOT_OURS = (
+    *("push_to_hub", "repo_id", "private", "pretrained_path", "pretrained_revision", "use_peft"),
+    "heatmap_weight",
+)
 
 
 @cache

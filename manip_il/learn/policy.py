@@ -16,7 +16,7 @@ from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import CONFIG, Checkpoint, in_one_line
 from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
-from manip_il.learn.network import MLPNetwork, Shape, read_weights, threads
+from manip_il.learn.network import MLPNetwork, NetworkConfig, read_weights, threads
 from manip_il.mdp import F32, F64, I64, Images
 
 if TYPE_CHECKING:  # `episode_policy` imports LeRobot, which takes seconds
@@ -134,7 +134,7 @@ class _Perceptron:
         self._keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in checkpoint.numbers]
         width = sum(checkpoint.numbers[key] for key in self._keys)
         with in_one_line(f"{checkpoint.path}: weights and {CONFIG} do not match"):
-            self.module = MLPNetwork(width, checkpoint.action, Shape.of(checkpoint.config))
+            self.module = MLPNetwork(width, checkpoint.action, NetworkConfig.of(checkpoint.config))
             self.module.load_state_dict(read_weights(checkpoint.path))
         self.module.to(device).eval()
         space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # the network converts joint_delta

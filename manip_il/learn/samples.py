@@ -21,7 +21,7 @@ from manip_il.data.camera import decode
 from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.joined import JoinedDatasets
 from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, TASK_INDEX, TIMESTAMP
-from manip_il.data.schema import ACTION, LABEL_VALID, STATE
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.checkpoint import in_one_line
@@ -131,7 +131,9 @@ def load_data(
     (N, n) to targets; None if the targets are the datasets' actions. on_frames: called with the number of newly
     decoded frames. Raises `NotFiniteError` and what `Windows.usable` raises.
     """
-    features = [key for key in (*(policy.input_features or {}), ACTION) if key in meta.features]
+    predicted = [ENVIRONMENT_STATE] if getattr(policy, "aux_weight", 0) else []  # by the cnn
+    wanted = dict.fromkeys([*(policy.input_features or {}), ACTION, *predicted])
+    features = [key for key in wanted if key in meta.features]
     cameras = [key for key in features if key in meta.camera_keys]
     numbers = [key for key in features if key not in cameras]
     table = joined_columns(meta.roots, [*numbers, *_ALWAYS])

@@ -107,8 +107,7 @@ class Trainer:
         self.meta.table = self.data.table
         drawn = row_weights(datasets, shares, self.data.train) if shares else None
         drawn = drawn if weights is None else weights[self.data.train]
-        shift = 0 if getattr(policy, "heatmap_weight", 0) else Augment.shift  # heat maps do not move with a crop
-        self._augment = Augment(shift) if config.augments else None
+        self._augment = Augment() if config.augments else None
         self.origin = self._origin(datasets, shares, space)
         self.pipeline.dataset = DatasetConfig(self.meta.repo_id, root=str(_portable(datasets[-1].root)))
         self.pipeline.output_dir = output_dir
