@@ -44,12 +44,13 @@ from manip_il.data.schema import GRIPPERS, JOINT_TARGETS, RobotTaskSpec
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.mdp import F64
+from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import rotation_vector
+from manip_il.robots.table import get_robot
 
 if TYPE_CHECKING:  # importing inverse kinematics takes a second
     from manip_il.learn.checkpoint import Checkpoint
     from manip_il.robots.ik import ArmIK
-    from manip_il.robots.robot import Robot
 
 LAST = (-1,)  # index of the gripper's opening, for a single arm
 _ARM = slice(None, -1)  # joints of a single arm, in state and action
@@ -121,8 +122,6 @@ class Conversion:
 
     @property
     def _robot(self) -> Robot:
-        from manip_il.robots.table import get_robot
-
         return get_robot(self.robot)
 
 
@@ -145,6 +144,5 @@ def conversion_for(space: str, spec: RobotTaskSpec, start: Checkpoint | None = N
 @cached_per_thread()
 def _arm_ik(robot: str) -> ArmIK:
     from manip_il.robots.ik import ArmIK
-    from manip_il.robots.table import get_robot
 
     return ArmIK(get_robot(robot))

@@ -11,10 +11,12 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
+from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, MUST_AGREE, STATE, RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError, UnknownName
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
@@ -30,7 +32,6 @@ _STEPS = (  # registry names of LeRobot's default steps, and ours: they load not
     *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER, JOINTS_ALONE),
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-MOST_VALUES = 10_000  # in one numeric input of a network, or in its action
 _PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
 _MLP_SHAPE = (  # options that define an mlp's architecture
     *("width", "depth", "activation", "loss", "components", "bins", "sigma", "clamp", "scales"),
@@ -152,26 +153,33 @@ class Checkpoint:
         processors = {name: processor_steps(path / name) for name in PROCESSORS if (path / name).is_file()}
         with in_one_line(f"{path / CONFIG} has features that cannot be read"):
             inputs, outputs = _features(config["input_features"]), _features(config["output_features"])
-            action = _size(ACTION, outputs[ACTION][1])
-            pictures = {key.removeprefix(IMAGES): shape for key, (kind, shape) in inputs.items() if kind == "VISUAL"}
-            sizes = {name: (height, width) for name, (_, height, width) in pictures.items()}
+            sizes = {key.removeprefix(IMAGES): shape[1:] for key, (kind, shape) in inputs.items() if kind == "VISUAL"}
             space, robot, grippers = _space(config, processors.get(PROCESSORS[1], []))
-        return cls(
-            path,
-            config,
-            numbers={
-                key: _size(key, shape)
-                for key, (kind, shape) in inputs.items()
-                if kind in ("STATE", "ENV") and all(shape)  # not the environment state of `JointsAloneStep`
-            },
-            pictures={name: size for name, size in sizes.items() if not name.startswith(_PLACEHOLDER)},
-            action=action,
-            space=space,
-            robot=robot,
-            grippers=grippers,
-            origin=origin,
-            processors=processors,
-        )
+            return cls(
+                path,
+                config,
+                numbers={
+                    key: math.prod(shape)
+                    for key, (kind, shape) in inputs.items()
+                    if kind in ("STATE", "ENV") and all(shape)  # not the environment state of `JointsAloneStep`
+                },
+                pictures={
+                    name: (height, width)
+                    for name, (height, width) in sizes.items()
+                    if not name.startswith(_PLACEHOLDER)
+                },
+                action=math.prod(outputs[ACTION][1]),
+                space=space,
+                robot=robot,
+                grippers=grippers,
+                origin=origin,
+                processors=processors,
+            )
+
+    @cached_property
+    def sha256(self) -> str:
+        """The hash of everything that decides how the policy acts, see `policy_sha256`."""
+        return policy_sha256(self.path)
 
     @property
     def kind(self) -> str:
@@ -229,10 +237,6 @@ class Checkpoint:
 def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Return name -> kind and shape of a policy's inputs or outputs."""
     return {key: (str(value["type"]), tuple(map(int, value["shape"]))) for key, value in features.items()}
-
-
-def _size(key: str, shape: Sequence[int]) -> int:
-    return checks.whole(f"the number of values of {key}", math.prod(shape), 0, MOST_VALUES)
 
 
 def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tuple[str, str, tuple[int, ...]]:

@@ -100,20 +100,12 @@ class FitConfig:
     @cached_property
     def start(self) -> Checkpoint | None:
         """The checkpoint in `policy.path`. Raises `ManipError` if it cannot be read."""
-        if "path" not in self.policy:
-            return None
-        from manip_il.learn.checkpoint import Checkpoint
+        return _open(Path(self.policy["path"])) if "path" in self.policy else None
 
-        return Checkpoint.open(Path(self.policy["path"]))
-
-    @property
+    @cached_property
     def initial(self) -> Checkpoint | None:
         """The checkpoint with the initial weights, in `policy.path` or `init_from`. Raises what `start` raises."""
-        if self.init_from is None:
-            return self.start
-        from manip_il.learn.checkpoint import Checkpoint
-
-        return Checkpoint.open(self.init_from)
+        return self.start if self.init_from is None else _open(self.init_from)
 
     @property
     def kind(self) -> str:
@@ -144,6 +136,12 @@ class FitConfig:
     def total_steps(self) -> int:
         """Gradient steps."""
         return self.steps or self.defaults.steps
+
+
+def _open(path: Path) -> Checkpoint:
+    from manip_il.learn.checkpoint import Checkpoint  # which imports numpy
+
+    return Checkpoint.open(path)
 
 
 def check_convertible(kind: str, space: str) -> None:

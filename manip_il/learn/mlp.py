@@ -22,7 +22,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, UsageError
 from manip_il.learn.names import EE_DELTA
 from manip_il.learn.network import MLPNetwork, NetworkConfig
 from manip_il.learn.samples import Table, valid_frames
@@ -77,11 +77,12 @@ class MLPConfig(NetworkConfig, PreTrainedConfig):
     def validate_features(self) -> None:
         """Raise unless `observation.state` and `action` exist and have the same size."""
         state, action = self.robot_state_feature, self.action_feature
-        if state is None or action is None:
-            have = ", ".join([*(self.input_features or {}), *(self.output_features or {})])
-            raise UsageError(f"the {self.type} policy needs observation.state and action; the features are {have}")
-        if len(state.shape) != 1 or state.shape != action.shape:
-            raise MismatchError("shape", "observation.state", state.shape, "action", action.shape)
+        shapes = [None if feature is None else feature.shape for feature in (state, action)]
+        if shapes[0] is None or len(shapes[0]) != 1 or shapes[0] != shapes[1]:
+            raise UsageError(
+                f"the {self.type} policy needs observation.state and action of the same size; their shapes are "
+                f"{shapes[0]} and {shapes[1]}"
+            )
 
     @override
     def get_optimizer_preset(self) -> AdamWConfig:

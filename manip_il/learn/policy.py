@@ -48,9 +48,8 @@ class LearnedPolicy:
         if opened.kind == MLP:
             return cls(_Perceptron(opened, device), opened)
         from manip_il.learn.episode_policy import EpisodePolicy
-        from manip_il.learn.lerobot_policy import load_policy
 
-        return cls(EpisodePolicy(*load_policy(opened, device, trust), task), opened)
+        return cls(EpisodePolicy(opened, device, task, trust), opened)
 
     @property
     def cameras(self) -> tuple[str, ...]:
