@@ -34,7 +34,7 @@ every policy.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,6 @@ _ARM = slice(None, -1)  # joints of a single arm, in state and action
 _POSITION = slice(0, 3)
 _ROTATION = slice(3, 6)
 _POSE = 6
-Numbers = TypeVar("Numbers", bound=np.floating[Any])
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class Conversion:
                 f"{EE_DELTA} needs an arm with at least {_POSE} joints; {self.robot} has {joints}; use {JOINT_DELTA}"
             )
 
-    def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+    def encode(self, actions: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:
         """Convert actions (N, n), joint targets and openings, to this space, given measured joint states (N, n)."""
         if self.space == JOINT_TARGET:
             return actions
@@ -97,7 +96,7 @@ class Conversion:
             target[_POSITION], target[_ROTATION] = wanted - position, rotation_vector(turned @ rotation.T)
         return targets
 
-    def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+    def decode(self, targets: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:
         """Convert targets (N, n) in this space to actions (N, n), joint targets and openings; inverse of `encode`."""
         if self.space == JOINT_TARGET:
             return targets

@@ -287,11 +287,9 @@ def require_trust(
 
 def read_config(path: Path) -> dict[str, Any]:
     """Return the `config.json` of a folder. Raises `ManipError` if the folder is incomplete."""
-    if not (path / CONFIG).is_file():
-        raise ManipError(f"no {CONFIG} in {path}; expected a pretrained_model folder of LeRobot's")
+    config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json")
     if not (path / WEIGHTS).is_file():
         raise ManipError(f"no {WEIGHTS} in {path}: the weights are missing")
-    config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json")
     if not isinstance(config.get("type"), str):
         raise ManipError(f"{path / CONFIG} is not the configuration of a LeRobot policy: it has no type")
     return config

@@ -227,6 +227,12 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def require_device(device: str) -> None:
+    """Raise `UsageError` for a GPU if PyTorch finds none."""
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise UsageError(f"device is {device!r}, but PyTorch finds no GPU here; expected 'cpu'")
+
+
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
     """Return weights (n, d) and statistics (n,) by name from a folder; `ManipError` if they cannot be read."""
     path = Path(pretrained_model) / WEIGHTS
