@@ -19,7 +19,7 @@ from manip_il import checks
 from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, MUST_AGREE, STATE, RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError, UnknownName
-from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
+from manip_il.learn.names import ACTION_SPACES, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
 from manip_il.sim.config import CameraConfig, Look
 
 CONFIG = "config.json"
@@ -187,6 +187,12 @@ class Checkpoint:
         return self.config["type"]
 
     @property
+    def options(self) -> dict[str, Any]:
+        """The policy's options. Weights that torchvision would download are left out: the checkpoint has them."""
+        options = {name: value for name, value in self.config.items() if name != "type"}
+        return options | dict.fromkeys({"pretrained_backbone_weights"} & options.keys())
+
+    @property
     def observation(self) -> str:
         """The member of `OBSERVATIONS` that the policy takes."""
         if not self.pictures:
@@ -244,12 +250,12 @@ def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tup
 
     Where no grippers are named, only the last number counts as one.
     """
-    options: Mapping[str, Any] = next((one["config"] for one in steps if one["registry_name"] == DECODER), {})
-    own = config["type"] in OWN_SPACE
-    space = config.get("action_space", JOINT_DELTA) if own else options.get("action_space", JOINT_TARGET)
+    decoder: Mapping[str, Any] = next((step["config"] for step in steps if step["registry_name"] == DECODER), {})
+    given = config if config["type"] in OWN_SPACE else {"action_space": JOINT_TARGET, **decoder}
+    space = given["action_space"]
     if space not in ACTION_SPACES:
         raise UnknownName("action space", checks.shorten(space), ACTION_SPACES)
-    return space, str(options.get("robot", "")), tuple((config if own else options).get("grippers", (-1,)))
+    return space, str(decoder.get("robot", "")), tuple(given.get("grippers", (-1,)))
 
 
 @contextmanager

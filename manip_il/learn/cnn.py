@@ -19,7 +19,7 @@ from torch.nn.functional import interpolate
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, check_same_spec
 from manip_il.errors import UsageError, shorten
-from manip_il.learn.mlp import MLPConfig, MLPPolicy, labelled, offsets_of
+from manip_il.learn.mlp import MLPConfig, MLPPolicy, labelled
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork, NetworkConfig, fit_statistics, perceptron
@@ -217,10 +217,8 @@ class CNNPolicy(MLPPolicy):
         return self.model.row_losses(inputs, actions).view(len(errors), DRAWS).mean(1)
 
     @override
-    def _offsets(self, config: MLPConfig, features: Any) -> tuple[int, ...]:
-        """Return the indices of the offsets in the environment state, if that is an input or is predicted."""
-        reads = ENVIRONMENT_STATE in self.inputs or self.config.aux_weight > 0
-        return offsets_of(features if reads else {})
+    def _offsets(self, places: tuple[int, ...]) -> tuple[int, ...]:
+        return places  # in the environment state, which need not be an input
 
     @override
     def _learn_statistics(self, table: Table, dataset_meta: Any) -> None:

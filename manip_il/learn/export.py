@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, GRIPPERS, IMAGES, OPENINGS, SERVOS, STATE, TWO_ARMS
 from manip_il.errors import ManipError
+from manip_il.learn.action_spaces import LAST
 from manip_il.learn.batches import to_float
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
@@ -145,7 +146,7 @@ def _entry(checkpoint: Checkpoint, key: str) -> dict[str, Any]:
     entry["names"] = list(origin.joint_names)
     meaning = origin.action_meaning
     if meaning in _JOINT_UNITS:
-        grippers = [place % size for place in GRIPPERS[meaning]]
+        grippers = [place % size for place in GRIPPERS.get(meaning, LAST)]
         entry["units"] = [_JOINT_UNITS[meaning][place in grippers] for place in range(size)]
     return entry
 

@@ -69,9 +69,7 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
     require_device(str(given["device"]))  # LeRobot would switch devices
     if fit.start is not None:
         source = f"--policy.path={fit.start.path}"
-        saved = {name: value for name, value in fit.start.config.items() if name not in ("type", *NOT_OURS)}
-        if "pretrained_backbone_weights" in saved:  # the checkpoint has the weights; torchvision would download its own
-            saved["pretrained_backbone_weights"] = None
+        saved = {name: value for name, value in fit.start.options.items() if name not in NOT_OURS}
         if saved.get("states") and "states" not in given:  # a dataset's path, which only the user may name
             raise UsageError(f"{source} learnt from a dataset of states; give it again with --policy.states=DATASET")
     options = saved | given

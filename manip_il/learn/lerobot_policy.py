@@ -115,14 +115,10 @@ def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tup
     not trusted, or if LeRobot cannot load the folder.
     """
     cls = policy_class(checkpoint.kind)
-    own = {key: value for key, value in checkpoint.config.items() if key != "type"}
     checkpoint.require_trust(trust)
     with _lerobot(f"{checkpoint.path}: LeRobot cannot load it"):
         # not `PreTrainedConfig.from_pretrained`, which leaves a temporary file behind each time
-        config = draccus.decode(cls, own | {"device": device})
-        # The weights come from the checkpoint; torchvision would download its own first.
-        if hasattr(config, "pretrained_backbone_weights"):
-            config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
+        config = draccus.decode(cls, checkpoint.options | {"device": device})
         processors = load_processors(checkpoint, config, trust=trust)
         policy = get_policy_class(checkpoint.kind).from_pretrained(checkpoint.path, config=config, strict=True)
         return policy, *processors

@@ -114,7 +114,8 @@ class MLPPolicy(PreTrainedPolicy):
         config.validate_features()
         self.inputs = [key for key in (STATE, ENVIRONMENT_STATE) if key in (config.input_features or {})]
         if config.scales and not config.scaled and dataset_meta is not None:
-            config.scaled = self._offsets(config, dataset_meta.features)
+            reads = ENVIRONMENT_STATE in self.inputs or getattr(config, "aux_weight", 0) > 0
+            config.scaled = self._offsets(offsets_of(dataset_meta.features if reads else {}))
         self._build(config)
         if dataset_meta is not None:
             self._learn_statistics(training_table(config, dataset_meta), dataset_meta)
@@ -151,10 +152,10 @@ class MLPPolicy(PreTrainedPolicy):
         width = sum(features[key].shape[0] for key in self.inputs)
         self.model = MLPNetwork(width, features[STATE].shape[0], config)
 
-    def _offsets(self, config: MLPConfig, features: Any) -> tuple[int, ...]:
-        """Return the indices of the inputs that are offsets between two things."""
-        n = (config.input_features or {})[STATE].shape[0]
-        return tuple(n + i for i in offsets_of(features if ENVIRONMENT_STATE in self.inputs else {}))
+    def _offsets(self, places: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the indices among the inputs of these numbers of the environment state."""
+        n = (self.config.input_features or {})[STATE].shape[0]
+        return tuple(n + place for place in places)
 
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
         """Return the network's inputs (B, d) for a batch of observations."""

@@ -93,8 +93,8 @@ class LearnedPolicy:
     def _numbers(self, states: F32, environment_states: F32) -> Batch:
         given = {STATE: states, ENVIRONMENT_STATE: environment_states}
         return {
-            key: torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
-            for key, values in given.items()
+            key: torch.from_numpy(np.ascontiguousarray(given[key], dtype=np.float32))
+            for key in given
             if key in self.checkpoint.numbers
         }
 

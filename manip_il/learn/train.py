@@ -31,7 +31,7 @@ from lerobot.utils.random_utils import set_seed
 from manip_il.data.dataset import Dataset
 from manip_il.data.joined import JoinedDatasets
 from manip_il.errors import NotFiniteError
-from manip_il.learn.action_spaces import Conversion, conversion_for
+from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import Augment, Order, generator_of, pictures_to_float
 from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
@@ -107,6 +107,8 @@ class Trainer:
         last = last_checkpoint(output_dir, resume=resume)
         resumed = None if last is None else Checkpoint.open(last / PRETRAINED_MODEL)
         self.conversion = conversion_for(space, spec, resumed or config.initial)
+        in_processors = is_in_processors(self.pipeline.policy.type, self.conversion)
+        self.encoder = self.conversion if in_processors else None  # else the network converts
         self.meta: Any = JoinedDatasets(datasets)
         self.data = self.read_data(columns, on_frames)
         self.order = self.draw_order(shares, weights)
@@ -115,11 +117,6 @@ class Trainer:
         self.step = 0
         with threads(config.threads):
             self.build_networks(resumed)
-
-    @property
-    def encoder(self) -> Conversion | None:
-        """The conversion of the data's actions to targets, if the policy's network does not do it itself."""
-        return self.conversion if is_in_processors(self.pipeline.policy.type, self.conversion) else None
 
     def read_data(self, columns: Sequence[str], on_frames: Callable[[int], None] | None) -> Samples:
         """Read the samples of the datasets, of which the policy observes `columns`."""
