@@ -34,7 +34,7 @@ from manip_il.chapter.discriminators import Discriminator
 from manip_il.chapter.episodes import ActionRange, Demonstrations, Lockstep, Transitions
 from manip_il.chapter.learning import airl, gail
 from manip_il.chapter.ppo import Learner, seed_generators
-from manip_il.learn.network import MLPNetwork, Shape, fit_statistics, threads
+from manip_il.learn.network import MLPNetwork, NetworkConfig, fit_statistics, threads
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
@@ -138,7 +138,7 @@ SETTINGS = {
     "Pendulum-v1": Settings(steps=100_000, ppo=PPOConfig(lr=2e-3, minibatches=8)),
     "CartPole-v1": Settings(steps=30_000, ppo=PPOConfig(lr=1e-3, minibatches=8)),
 }
-SHAPE = Shape(width=64, depth=2, loss="gaussian", action_space="joint_target")
+SHAPE = NetworkConfig(width=64, depth=2, loss="gaussian", action_space="joint_target")
 _QUICK = {"steps": 1_000, "episode_steps": 20, "demonstrations": 2}
 
 

@@ -1,27 +1,23 @@
-"""What a `cnn` sees in scenes that it was not trained on: errors of its predicted state, and a picture of heat maps.
+"""What a `cnn` sees in scenes that it was not trained on: errors of its predicted state.
 
-Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET [PICTURE.png], with a dataset from `manip-il data redraw` that
-has another seed. The picture needs a policy trained with heat maps (`--policy.heatmap_weight`).
+Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET, with a dataset from `manip-il data redraw` that has another
+seed.
 """
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 
 from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.learn.cnn import CNNPolicy
 
-FRAMES, ROWS = 2_000, 4  # number of frames to evaluate, and to draw
-ENLARGED = 2
-COLOURS = np.array([[0.1, 0.9, 0.3], [1.0, 0.1, 0.6], [0.2, 0.4, 1.0], [1.0, 0.7, 0.0]])  # colours of points, in turn
+FRAMES = 2_000
 Batch = dict[str, torch.Tensor]
 
 
@@ -60,27 +56,6 @@ def report(policy: CNNPolicy, batch: Batch, names: tuple[str, ...]) -> None:
             print(f"{name:20} {np.median(off):6.1f} mrad, nine of ten within {np.quantile(off, 0.9):.1f}")
 
 
-def draw(policy: CNNPolicy, batch: Batch, points: tuple[str, ...]) -> Image.Image:
-    """Return pictures of all cameras side by side, one frame per row, overlaid with the points' heat maps."""
-    policy.train()  # heat maps are kept only in training mode
-    with torch.no_grad():
-        policy.forward({key: value[:ROWS] for key, value in batch.items()} | {"action": batch[STATE][:ROWS]})
-    columns: list[NDArray[np.float64]] = []
-    for camera, encoder in zip(policy.cameras, policy.encoders, strict=True):
-        pictures = batch[camera][:ROWS].permute(0, 2, 3, 1).double().numpy()
-        size = (pictures.shape[2], pictures.shape[1])
-        maps: Any = encoder.maps
-        for number in range(len(points)):
-            heat = maps[:ROWS, number].exp().double().numpy()
-            for picture, one in zip(pictures, heat / heat.max(axis=(1, 2), keepdims=True), strict=True):
-                wide = Image.fromarray(one.astype(np.float32)).resize(size, Image.Resampling.BILINEAR)
-                share = 0.75 * np.asarray(wide, np.float64)[..., None]
-                picture[:] = (1 - share) * picture + share * COLOURS[number % len(COLOURS)]
-        columns.append(np.concatenate(pictures))
-    whole = Image.fromarray((np.concatenate(columns, axis=1) * 255).astype(np.uint8))
-    return whole.resize((whole.width * ENLARGED, whole.height * ENLARGED), Image.Resampling.NEAREST)
-
-
 def main() -> None:
     if len(sys.argv) < 3:
         print(__doc__)
@@ -91,10 +66,6 @@ def main() -> None:
     rows = np.sort(np.random.default_rng(1).choice(count, min(FRAMES, count), replace=False))
     batch = batch_of(root, spec.cameras, rows)
     report(policy, batch, spec.environment_state_names)
-    if len(sys.argv) > 3:
-        points = tuple(name for name in spec.keypoints if "corner" not in name)
-        draw(policy, batch, points).save(sys.argv[3], optimize=True)
-        print(f"{sys.argv[3]}: {', '.join(points)}")
 
 
 if __name__ == "__main__":

@@ -106,7 +106,7 @@ def our_samples(root: Path) -> Samples:
     columns = {key: torch.from_numpy(np.array(values)) for key, values in table.items()}
     pictures = {camera: decode([dataset.camera(camera)]) for camera in dataset.cameras}
     windows, tasks, rows = Windows(table["episode_index"], {}), [*dataset.tasks.values()], np.arange(len(dataset))
-    return Samples(windows, columns, pictures, np.array(tasks, object), table, rows, rows[:0])
+    return Samples(windows, columns, pictures, np.array(tasks, object), rows, rows[:0])
 
 
 def our_epoch(samples: Samples, augment: Augment | None, number: Iterator[int]) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
@@ -175,24 +175,20 @@ class RunConfig(Seeded):
 
 
 def plan_of(fit: FitConfig) -> tuple[int, int]:
-    """Return how many actions a policy plans at once, and how many frames at an episode's end its fit skips."""
-    from manip_il.learn.lerobot_config import policy_config
+    """Return how many actions a policy plans at once, and how many frames at an episode's end its fit skips.
 
-    policy = policy_config(fit)
+    Raises what `lerobot_options` raises, and imports LeRobot, as that constructs its configurations.
+    """
+    from manip_il.learn.lerobot_config import lerobot_options
+
+    policy: Any = lerobot_options(fit)[0].policy
     return len(policy.action_delta_indices or [0]), getattr(policy, "drop_n_last_frames", 0)
 
 
 def check_labels(config: RunConfig) -> None:
-    """Raise `UsageError` for labels that the policy cannot learn from, or for invalid LeRobot options.
-
-    This imports LeRobot to construct its configurations.
-    """
-    from manip_il.learn.lerobot_config import lerobot_options
-
-    fit = config.fit
-    lerobot_options(fit)
-    plan, dropped = plan_of(fit)
-    name, rule = fit.policy.get("type", "mlp"), config.query
+    """Raise `UsageError` for labels that the policy cannot learn from, or for invalid LeRobot options."""
+    plan, dropped = plan_of(config.fit)
+    name, rule = config.fit.kind, config.query
     if config.label == "per_state" and plan > 1 and rule.kind != "every":
         raise UsageError(
             f"query={rule} with label=per_state gives single labels, but {name} learns from {plan} in a row; "

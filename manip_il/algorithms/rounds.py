@@ -28,6 +28,7 @@ from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.data.schema import LABEL_VALID
 from manip_il.errors import NothingToLearnError
 from manip_il.learn.fit_config import LEROBOT, FitConfig
+from manip_il.learn.train import Trainer
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_base
@@ -170,8 +171,6 @@ def fit_round(
 
     member: index in the ensemble. on_log: called with each step's metrics, {} if there are none.
     """
-    from manip_il.learn.train import Trainer  # rollouts alone do not need torch
-
     into = folder / (f"{POLICY}_{member}" if member else POLICY)
     return Trainer([*map(Dataset.open, roots)], fit, into, resume=True).fit(on_log)
 

@@ -291,14 +291,15 @@ class Dataset:
         return len(np.unique(index[success.astype(bool)]))
 
 
-def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:
+def joined_columns(datasets: Sequence[Dataset | Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Read and concatenate columns, (T,) or (T, d), of several datasets; frames and episodes are renumbered.
 
     Raises what `Dataset.columns` raises.
     """
     pieces: list[dict[str, NDArray[Any]]] = []
     episodes = frames = 0
-    for dataset in map(Dataset.open, roots):
+    for given in datasets:
+        dataset = given if isinstance(given, Dataset) else Dataset.open(given)
         before = {layout.EPISODE_INDEX: episodes, layout.INDEX: frames}
         columns = dataset.columns(names)
         columns |= {name: columns[name] + first for name, first in before.items() if name in columns}

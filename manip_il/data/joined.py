@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import reduce
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import PICTURES
@@ -23,6 +25,8 @@ class JoinedDatasets:
     stats: over all frames. Cameras have ImageNet's mean and std, as in `lerobot-train`; their other statistics are the
     first dataset's. tasks: each text once.
     """
+
+    table: dict[str, NDArray[Any]]  # numeric columns, once training has read them
 
     def __init__(self, datasets: Sequence[Dataset]):
         self.datasets, first = tuple(datasets), datasets[0]

@@ -34,7 +34,7 @@ every policy.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,19 +44,19 @@ from manip_il.data.schema import GRIPPERS, JOINT_TARGETS, RobotTaskSpec
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.mdp import F64
+from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import rotation_vector
+from manip_il.robots.table import get_robot
 
 if TYPE_CHECKING:  # importing inverse kinematics takes a second
     from manip_il.learn.checkpoint import Checkpoint
     from manip_il.robots.ik import ArmIK
-    from manip_il.robots.robot import Robot
 
 LAST = (-1,)  # index of the gripper's opening, for a single arm
 _ARM = slice(None, -1)  # joints of a single arm, in state and action
 _POSITION = slice(0, 3)
 _ROTATION = slice(3, 6)
 _POSE = 6
-Numbers = TypeVar("Numbers", bound=np.floating[Any])
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Conversion:
                 f"{EE_DELTA} needs an arm with at least {_POSE} joints; {self.robot} has {joints}; use {JOINT_DELTA}"
             )
 
-    def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+    def encode(self, actions: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:
         """Convert actions (N, n), joint targets and openings, to this space, given measured joint states (N, n)."""
         if self.space == JOINT_TARGET:
             return actions
@@ -96,7 +96,7 @@ class Conversion:
             target[_POSITION], target[_ROTATION] = wanted - position, rotation_vector(turned @ rotation.T)
         return targets
 
-    def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+    def decode(self, targets: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:
         """Convert targets (N, n) in this space to actions (N, n), joint targets and openings; inverse of `encode`."""
         if self.space == JOINT_TARGET:
             return targets
@@ -121,8 +121,6 @@ class Conversion:
 
     @property
     def _robot(self) -> Robot:
-        from manip_il.robots.table import get_robot
-
         return get_robot(self.robot)
 
 
@@ -145,6 +143,5 @@ def conversion_for(space: str, spec: RobotTaskSpec, start: Checkpoint | None = N
 @cached_per_thread()
 def _arm_ik(robot: str) -> ArmIK:
     from manip_il.robots.ik import ArmIK
-    from manip_il.robots.table import get_robot
 
     return ArmIK(get_robot(robot))

@@ -15,6 +15,7 @@ import torch
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import (
     AbsoluteActionsProcessorStep,
+    NormalizerProcessorStep,
     ObservationProcessorStep,
     PolicyProcessorPipeline,
     ProcessorStepRegistry,
@@ -28,7 +29,6 @@ from manip_il.learn.checkpoint import DECODER, JOINTS_ALONE, MEASURED
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET, OWN_SPACE
 
 Pipeline = PolicyProcessorPipeline[Any, Any]
-_NORMALISER = "normalizer_processor"
 
 
 @ProcessorStepRegistry.register(MEASURED)
@@ -70,10 +70,9 @@ class JointTargetsStep(AbsoluteActionsProcessorStep):
         targets = transition.get(TransitionKey.ACTION)
         states = self.relative_step.get_cached_state() if self.relative_step is not None else None
         if not isinstance(targets, torch.Tensor) or states is None or targets.shape != states.shape:
-            given = f"{tuple(getattr(targets, 'shape', ()))} and {None if states is None else tuple(states.shape)}"
             raise ManipError(
                 f"{self.action_space}: an action is converted with the joints measured at its own step; expected the "
-                f"output of one step and its observation, both (B, n), not {given}"
+                "output of one step and its observation, both (B, n)"
             )
         rows = targets.detach().to("cpu", torch.float32).numpy()
         conversion = Conversion(self.action_space, self.robot, tuple(self.grippers))
@@ -106,10 +105,9 @@ def is_in_processors(kind: str, found: Conversion) -> bool:
 def add_steps(before: Pipeline, after: Pipeline, found: Conversion) -> None:
     """Add a conversion's steps to a policy's pre- and postprocessor; the policy then sees only converted actions."""
     measured = MeasuredJointsStep(converted=True)
-    names = [getattr(step, "_registry_name", "") for step in before.steps]
-    place = names.index(_NORMALISER) if _NORMALISER in names else len(names)
+    place = next(i for i, step in enumerate(before.steps) if isinstance(step, NormalizerProcessorStep))
     before.steps = [*before.steps[:place], measured, *before.steps[place:]]
-    after.steps = [
-        *after.steps,
-        JointTargetsStep(relative_step=measured, action_space=found.space, robot=found.robot, grippers=found.grippers),
-    ]
+    decoder = JointTargetsStep(
+        relative_step=measured, action_space=found.space, robot=found.robot, grippers=found.grippers
+    )
+    after.steps = [*after.steps, decoder]

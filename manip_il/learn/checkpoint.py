@@ -11,13 +11,15 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
+from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, MUST_AGREE, STATE, RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError, UnknownName
-from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
+from manip_il.learn.names import ACTION_SPACES, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
 from manip_il.sim.config import CameraConfig, Look
 
 CONFIG = "config.json"
@@ -30,11 +32,10 @@ _STEPS = (  # registry names of LeRobot's default steps, and ours: they load not
     *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER, JOINTS_ALONE),
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-MOST_VALUES = 10_000  # in one numeric input of a network, or in its action
 _PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
 _MLP_SHAPE = (  # options that define an mlp's architecture
-    *("width", "depth", "activation", "loss", "components", "bins", "clamp", "scales", "scaled"),
-    *("grippers", "action_space"),
+    *("width", "depth", "activation", "loss", "components", "bins", "sigma", "clamp", "scales"),
+    *("scaled", "grippers", "action_space"),
 )
 
 
@@ -152,31 +153,44 @@ class Checkpoint:
         processors = {name: processor_steps(path / name) for name in PROCESSORS if (path / name).is_file()}
         with in_one_line(f"{path / CONFIG} has features that cannot be read"):
             inputs, outputs = _features(config["input_features"]), _features(config["output_features"])
-            action = _size(ACTION, outputs[ACTION][1])
-            pictures = {key.removeprefix(IMAGES): shape for key, (kind, shape) in inputs.items() if kind == "VISUAL"}
-            sizes = {name: (height, width) for name, (_, height, width) in pictures.items()}
+            sizes = {key.removeprefix(IMAGES): shape[1:] for key, (kind, shape) in inputs.items() if kind == "VISUAL"}
             space, robot, grippers = _space(config, processors.get(PROCESSORS[1], []))
-        return cls(
-            path,
-            config,
-            numbers={
-                key: _size(key, shape)
-                for key, (kind, shape) in inputs.items()
-                if kind in ("STATE", "ENV") and all(shape)  # not the environment state of `JointsAloneStep`
-            },
-            pictures={name: size for name, size in sizes.items() if not name.startswith(_PLACEHOLDER)},
-            action=action,
-            space=space,
-            robot=robot,
-            grippers=grippers,
-            origin=origin,
-            processors=processors,
-        )
+            return cls(
+                path,
+                config,
+                numbers={
+                    key: math.prod(shape)
+                    for key, (kind, shape) in inputs.items()
+                    if kind in ("STATE", "ENV") and all(shape)  # not the environment state of `JointsAloneStep`
+                },
+                pictures={
+                    name: (height, width)
+                    for name, (height, width) in sizes.items()
+                    if not name.startswith(_PLACEHOLDER)
+                },
+                action=math.prod(outputs[ACTION][1]),
+                space=space,
+                robot=robot,
+                grippers=grippers,
+                origin=origin,
+                processors=processors,
+            )
+
+    @cached_property
+    def sha256(self) -> str:
+        """The hash of everything that decides how the policy acts, see `policy_sha256`."""
+        return policy_sha256(self.path)
 
     @property
     def kind(self) -> str:
         """LeRobot's name for the policy."""
         return self.config["type"]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The policy's options. Weights that torchvision would download are left out: the checkpoint has them."""
+        options = {name: value for name, value in self.config.items() if name != "type"}
+        return options | dict.fromkeys({"pretrained_backbone_weights"} & options.keys())
 
     @property
     def observation(self) -> str:
@@ -204,8 +218,7 @@ class Checkpoint:
         """The options for building another mlp of this architecture; None for another kind of policy."""
         if self.kind != MLP:
             return None
-        kept = {name: self.config[name] for name in _MLP_SHAPE if name in self.config}
-        return {"type": MLP, **kept, "sigma": self.config.get("sigma", 0.0)}
+        return {name: self.config[name] for name in ("type", *_MLP_SHAPE)}
 
     def check_fits(self, spec: RobotTaskSpec) -> None:
         """Raise `MismatchError` naming both sides unless environments of `spec` have the policy's inputs and action."""
@@ -232,21 +245,17 @@ def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ..
     return {key: (str(value["type"]), tuple(map(int, value["shape"]))) for key, value in features.items()}
 
 
-def _size(key: str, shape: Sequence[int]) -> int:
-    return checks.whole(f"the number of values of {key}", math.prod(shape), 0, MOST_VALUES)
-
-
 def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tuple[str, str, tuple[int, ...]]:
     """Return action space, robot and grippers: from the configuration of mlp and cnn, or the postprocessor's step.
 
     Where no grippers are named, only the last number counts as one.
     """
-    options: Mapping[str, Any] = next((one["config"] for one in steps if one["registry_name"] == DECODER), {})
-    own = config["type"] in OWN_SPACE
-    space = config.get("action_space", JOINT_DELTA) if own else options.get("action_space", JOINT_TARGET)
+    decoder: Mapping[str, Any] = next((step["config"] for step in steps if step["registry_name"] == DECODER), {})
+    given = config if config["type"] in OWN_SPACE else {"action_space": JOINT_TARGET, **decoder}
+    space = given["action_space"]
     if space not in ACTION_SPACES:
         raise UnknownName("action space", checks.shorten(space), ACTION_SPACES)
-    return space, str(options.get("robot", "")), tuple((config if own else options).get("grippers", (-1,)))
+    return space, str(decoder.get("robot", "")), tuple(given.get("grippers", (-1,)))
 
 
 @contextmanager
@@ -284,11 +293,9 @@ def require_trust(
 
 def read_config(path: Path) -> dict[str, Any]:
     """Return the `config.json` of a folder. Raises `ManipError` if the folder is incomplete."""
-    if not (path / CONFIG).is_file():
-        raise ManipError(f"no {CONFIG} in {path}; expected a pretrained_model folder of LeRobot's")
+    config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json")
     if not (path / WEIGHTS).is_file():
         raise ManipError(f"no {WEIGHTS} in {path}: the weights are missing")
-    config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json")
     if not isinstance(config.get("type"), str):
         raise ManipError(f"{path / CONFIG} is not the configuration of a LeRobot policy: it has no type")
     return config

@@ -14,128 +14,140 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.policies.utils import populate_queues
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from torch import Tensor
 
-from manip_il.learn.checkpoint import in_one_line
+from manip_il.learn.checkpoint import Checkpoint, in_one_line
+from manip_il.learn.lerobot_policy import load_policy
 
 Batch = dict[str, Any]
 ROWS = 25  # rows per call; episodes in lockstep have consecutive numbers, so each has a row to itself
 
 
+@dataclass
+class _Episode:
+    """An episode that runs. memory: a copy of the policy, for diffusion only its queues. seed: of this step's draws."""
+
+    number: int
+    instruction: str
+    steps: int = 0
+    seed: int = 0
+    memory: Any = None
+
+    def begin_step(self) -> None:
+        """Count a step, and set its seed."""
+        sequence = np.random.SeedSequence([self.number, self.steps])
+        self.seed = int(sequence.generate_state(1, np.uint64)[0])
+        self.steps += 1
+
+
 class EpisodePolicy:
     """A LeRobot policy with its processors and one memory per episode.
 
-    module: the policy without any episode's memory. task: instruction for a policy that reads language, if
-    `begin` gives an episode no other.
+    `module` is the policy without any episode's memory.
+
+    Args:
+        checkpoint: The policy to load.
+        device: Torch's device.
+        task: Instruction for a policy that reads language, if `begin` gives an episode no other.
+        trust: Whether to load models and code that the checkpoint names.
+
+    Raises:
+        ManipError: What `load_policy` raises.
     """
 
-    def __init__(
-        self,
-        policy: PreTrainedPolicy,
-        before: Callable[[Batch], Batch],
-        after: Callable[[Tensor], Tensor],
-        task: str = "",
-    ):
-        policy.reset()
-        self.module = policy
-        self._before = before
-        self._after = after
+    def __init__(self, checkpoint: Checkpoint, device: str, task: str, trust: bool):
+        self.module, self._before, self._after = load_policy(checkpoint, device, trust)
+        self.module.reset()
         self._task = task
-        self._device = torch.device(policy.config.device or "cpu")
-        self._shared = {id(part): part for part in (policy.config, *policy.parameters(), *policy.buffers())}
-        self._instructions: dict[int, str] = {}
-        self._steps = Counter[int]()  # steps taken in every episode
-        self._memories: dict[int, Any] = {}  # a copy of the policy; for diffusion only its queues
+        self._device = torch.device(self.module.config.device or "cpu")
+        shared = (self.module.config, *self.module.parameters(), *self.module.buffers())
+        self._shared = {id(part): part for part in shared}
+        self._episodes: dict[int, _Episode] = {}
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> Tensor:
         """Return one action per row, (B, n). Episodes that are not listed have ended and are forgotten."""
-        self._forget([episode for episode in self._steps if episode not in set(episodes)])
-        seeds = [self._next_seed(episode) for episode in episodes]
+        before = self._episodes
+        self._episodes = {number: before.get(number) or _Episode(number, self._task) for number in episodes}
+        running = [self._episodes[number] for number in episodes]
+        for episode in running:
+            episode.begin_step()
         # mixed precision if the policy was trained with it, as in lerobot-eval
         half = torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext()
         with in_one_line("the policy cannot act"), half:
             if self.module.config.type == "diffusion":
-                actions = self._after(self._planned(self._observed(batch, episodes), episodes, seeds))
+                actions = self._after(self._planned(self._observed(batch, running), running))
             else:
-                rows = [{key: value[i : i + 1] for key, value in batch.items()} for i in range(len(episodes))]
-                actions = torch.cat([self._one(*row) for row in zip(rows, episodes, seeds, strict=True)])
+                rows = ({key: value[i : i + 1] for key, value in batch.items()} for i in range(len(running)))
+                actions = torch.cat([self._act_alone(*pair) for pair in zip(rows, running, strict=True)])
         return actions.to("cpu", torch.float32)
 
     def begin(self, instructions: Mapping[int, str]) -> None:
         """Drop the memory of episodes that begin, and set their instructions."""
-        self._forget(instructions)
-        self._instructions.update({episode: text for episode, text in instructions.items() if text})
+        for number, text in instructions.items():
+            self._episodes[number] = _Episode(number, text or self._task)
 
-    def _forget(self, episodes: Iterable[int]) -> None:
-        for episode in episodes:
-            for kept in (self._memories, self._steps, self._instructions):
-                kept.pop(episode, None)
+    def _act_alone(self, row: Batch, episode: _Episode) -> Tensor:
+        if episode.memory is None:
+            episode.memory = copy.deepcopy(self.module, dict(self._shared))
+        with _drawing(episode.seed, self._device):
+            return self._after(episode.memory.select_action(self._observed(row, [episode])))
 
-    def _one(self, row: Batch, episode: int, seed: int) -> Tensor:
-        if episode not in self._memories:
-            self._memories[episode] = copy.deepcopy(self.module, dict(self._shared))
-        with _drawing(seed, self._device):
-            return self._after(self._memories[episode].select_action(self._observed(row, [episode])))
+    def _observed(self, batch: Batch, episodes: Sequence[_Episode]) -> Batch:
+        return self._before({**batch, "task": [episode.instruction for episode in episodes]})
 
-    def _observed(self, batch: Batch, episodes: Sequence[int]) -> Batch:
-        return self._before({**batch, "task": [self._instructions.get(one, self._task) for one in episodes]})
-
-    def _next_seed(self, episode: int) -> int:
-        """Return the random seed of an episode's next step."""
-        step = self._steps[episode]
-        self._steps[episode] += 1
-        return int(np.random.SeedSequence([episode, step]).generate_state(1, np.uint64)[0])
-
-    def _planned(self, observed: Batch, episodes: Sequence[int], seeds: Sequence[int]) -> Tensor:
+    def _planned(self, observed: Batch, episodes: Sequence[_Episode]) -> Tensor:
         """Return actions (B, n) as in `DiffusionPolicy.select_action`, row by row, still normalised."""
         policy: Any = self.module
         batch = {key: value for key, value in observed.items() if isinstance(value, Tensor)}
         if images := policy.config.image_features:
             batch[OBS_IMAGES] = torch.stack([batch[key] for key in images], dim=-4)
-        waiting: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        for i, (episode, seed) in enumerate(zip(episodes, seeds, strict=True)):
-            if episode not in self._memories:
+        waiting: dict[int, list[_Episode]] = defaultdict(list)
+        for i, episode in enumerate(episodes):
+            if episode.memory is None:
                 policy.reset()
-                self._memories[episode] = policy._queues
-            queues = populate_queues(self._memories[episode], {key: value[i : i + 1] for key, value in batch.items()})
-            if not queues[ACTION]:
-                waiting[episode % ROWS].append((episode, seed))
+                episode.memory = policy._queues
+            populate_queues(episode.memory, {key: value[i : i + 1] for key, value in batch.items()})
+            if not episode.memory[ACTION]:
+                waiting[episode.number % ROWS].append(episode)
         while waiting:
             self._plan({row: asked.pop(0) for row, asked in waiting.items()})
-            waiting = defaultdict(list, {row: asked for row, asked in waiting.items() if asked})
-        return torch.cat([self._memories[episode][ACTION].popleft() for episode in episodes])
+            waiting = {row: asked for row, asked in waiting.items() if asked}
+        return torch.cat([episode.memory[ACTION].popleft() for episode in episodes])
 
-    def _plan(self, block: Mapping[int, tuple[int, int]]) -> None:
-        """Compute the next plans of some episodes. block: row of the network's batch -> (episode, seed)."""
+    def _plan(self, block: Mapping[int, _Episode]) -> None:
+        """Compute the next plans of some episodes, by their row of the network's batch."""
         policy: Any = self.module
         model, config = policy.diffusion, policy.config
         weight = next(model.parameters())
         generators = [torch.Generator(weight.device) for _ in range(ROWS)]
         batch: dict[str, Tensor] = {}
-        for row, (episode, seed) in block.items():
-            generators[row].manual_seed(seed)
-            for key, past in self._memories[episode].items():
+        for row, episode in block.items():
+            generators[row].manual_seed(episode.seed)
+            for key, past in episode.memory.items():
                 if key != ACTION:
                     asked = torch.stack(list(past), dim=1)
                     batch.setdefault(key, asked.new_zeros((ROWS, *asked.shape[1:])))[row] = asked[0]
         shape = (config.horizon, *config.action_feature.shape)
-        noise = [torch.randn(shape, generator=one, device=weight.device, dtype=weight.dtype) for one in generators]
+        noise = [
+            torch.randn(shape, generator=generator, device=weight.device, dtype=weight.dtype)
+            for generator in generators
+        ]
         seen = model._prepare_global_conditioning(batch)
         # each row's generator also draws the noise of its denoising steps, which LeRobot's `generate_actions` cannot do
         plans = model.conditional_sample(ROWS, seen, generators, torch.stack(noise))
         start = config.n_obs_steps - 1
         plans = plans[:, start : start + config.n_action_steps]
-        for row, (episode, _) in block.items():
-            self._memories[episode][ACTION].extend(plans[row : row + 1].transpose(0, 1))
+        for row, episode in block.items():
+            episode.memory[ACTION].extend(plans[row : row + 1].transpose(0, 1))
 
 
 @contextlib.contextmanager

@@ -16,27 +16,25 @@ from typing import Any, override
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, GRIPPERS, IMAGES, OPENINGS, SERVOS, STATE, TWO_ARMS
 from manip_il.errors import ManipError
+from manip_il.learn.action_spaces import LAST
 from manip_il.learn.batches import to_float
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.mdp import F64
+from manip_il.mdp import F32, Images
 
 TOLERANCE = 1e-5  # largest difference between the actions of the file and of the checkpoint [rad] or [m]
 SERVO_TOLERANCE = 1e-3  # largest difference for robots in servos' units [degrees]
 _OPSET = 17
-_ROWS = 64  # observations on which file and checkpoint are compared
+_ROWS = 64  # observations on which the graph is traced, and file and checkpoint are compared
 _JOINT_UNITS = {OPENINGS: ("rad", "m"), SERVOS: ("deg", "0 to 100"), TWO_ARMS: ("rad", "0 to 1")}  # (joints, grippers)
 _UNITS = {"x": "m", "y": "m", "z": "m", "width": "m", "tilt": "rad"}
 _UNITLESS = re.compile(r".*\.(axis_[xyz]\.[xyz]|cos[^.]*|sin[^.]*)")
-
-Arrays = dict[str, NDArray[Any]]
 
 
 class PolicyFunction(nn.Module):
@@ -47,24 +45,24 @@ class PolicyFunction(nn.Module):
 
     def __init__(self, policy: LearnedPolicy) -> None:
         super().__init__()
-        self.numbers = [key for key in (STATE, ENVIRONMENT_STATE) if key in policy.checkpoint.numbers]
+        numbers = [key for key in (STATE, ENVIRONMENT_STATE) if key in policy.checkpoint.numbers]
         self.cameras = sorted(IMAGES + camera for camera in policy.cameras)
-        self.inputs = [*self.numbers, *self.cameras]
+        self.inputs = [*numbers, *self.cameras]
         self.policy: Any = policy.module
         self.network: MLPNetwork = self.policy.model if self.cameras else self.policy
         self.requires_grad_(False).eval()
 
     @override
     def forward(self, *observations: Tensor) -> Tensor:
-        batch = dict(zip(self.inputs, observations, strict=True))
         if not self.cameras:
             return self.network.actions(torch.cat(observations, dim=1))
+        batch = dict(zip(self.inputs, observations, strict=True))
         pictures = {key: to_float(batch[key].permute(0, 3, 1, 2)) for key in self.cameras}
         return self.network.actions(self.policy.network_inputs({**batch, **pictures}))
 
 
-def export_onnx(path: Path) -> tuple[bytes, float]:
-    """Return a `pretrained_model` folder's policy as ONNX, and the largest change that the export makes to an action.
+def export_onnx(checkpoint: Checkpoint | Path) -> tuple[bytes, float]:
+    """Return a policy, or that in a `pretrained_model` folder, as ONNX, and the largest change of an action by that.
 
     Raises `ManipError` for a policy that cannot be exported or whose file would act differently from the checkpoint,
     and what `LearnedPolicy.load` raises.
@@ -72,40 +70,40 @@ def export_onnx(path: Path) -> tuple[bytes, float]:
     import onnx
     import onnxruntime
 
-    policy = LearnedPolicy.load(path)
-    if policy.checkpoint.space == EE_DELTA:
+    policy = LearnedPolicy.load(checkpoint)
+    checkpoint = policy.checkpoint
+    path, meta = checkpoint.path, checkpoint.origin
+    if checkpoint.space == EE_DELTA:
         raise ManipError(
             f"{path} was trained with {EE_DELTA}, whose inverse kinematics cannot be exported; train with {JOINT_DELTA}"
         )
     function = PolicyFunction(policy)
-    metadata = file_metadata(policy, function.inputs, policy_sha256(path))
-    example = _observations(policy, function, rows=2)
+    states, around, images = _random_observations(function.network, checkpoint)
+    pictures = {IMAGES + camera: picture for camera, picture in images.items()}
+    observations = {STATE: states, ENVIRONMENT_STATE: around, **pictures}
+    inputs = {key: observations[key] for key in function.inputs}
     content = io.BytesIO()
     with warnings.catch_warnings(action="ignore"):
         # Torch's preferred exporter needs two more packages and gives the same graph.
         torch.onnx.export(
             function,
-            tuple(map(torch.from_numpy, example.values())),
+            tuple(map(torch.from_numpy, inputs.values())),
             content,  # pyright: ignore[reportArgumentType]  # the parameter takes any writable file
-            input_names=list(example),
+            input_names=function.inputs,
             output_names=[ACTION],
-            dynamic_axes={name: {0: "batch"} for name in (*example, ACTION)},
+            dynamic_axes={name: {0: "batch"} for name in (*function.inputs, ACTION)},
             opset_version=_OPSET,
             dynamo=False,
         )
     model = onnx.load_model_from_string(content.getvalue())
-    model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = policy.checkpoint.action
-    texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
-    onnx.helper.set_model_props(model, texts)
+    model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = checkpoint.action
+    onnx.helper.set_model_props(model, metadata(checkpoint, function.inputs))
     model.producer_name = "manip-il"
     onnx.checker.check_model(model, full_check=True)
     data = model.SerializeToString()
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
-    observation = _observations(policy, function, _ROWS)
-    difference = float(
-        np.abs(np.asarray(session.run(None, observation)[0]) - _actions(policy, function, observation)).max()
-    )
-    meta = policy.checkpoint.origin
+    actions = np.asarray(session.run(None, inputs)[0])
+    difference = float(np.abs(actions - policy.act(states, around, images)).max())
     tolerance = SERVO_TOLERANCE if meta and meta.action_meaning == SERVOS else TOLERANCE
     if not difference <= tolerance:
         raise ManipError(
@@ -115,56 +113,54 @@ def export_onnx(path: Path) -> tuple[bytes, float]:
     return data, difference
 
 
-def file_metadata(policy: LearnedPolicy, inputs: Sequence[str], sha256: str) -> dict[str, Any]:
-    """Return the ONNX file's metadata: policy, robot, task, inputs and outputs; unknown entries are left out."""
-    shared = ("robot", "robot"), ("task", "task"), ("control_rate_hz", "fps"), ("action_meaning", "action_meaning")
-    config = policy.checkpoint.config
+def metadata(checkpoint: Checkpoint, inputs: Sequence[str]) -> dict[str, str]:
+    """Return the ONNX file's metadata: policy, inputs and outputs, and, if known, robot and task."""
+    origin = checkpoint.origin
     entries: dict[str, Any] = {
-        **{key: getattr(policy.checkpoint.origin, name, None) for key, name in shared},
-        "inputs": [_entry(policy, key) for key in inputs],
-        "outputs": [_entry(policy, ACTION)],
-        "policy_type": config["type"],
-        "policy_loss": config.get("loss"),
-        "policy_sha256": sha256,
+        "inputs": [_entry(checkpoint, key) for key in inputs],
+        "outputs": [_entry(checkpoint, ACTION)],
+        "policy_type": checkpoint.kind,
+        "policy_loss": checkpoint.config["loss"],
+        "policy_sha256": checkpoint.sha256,
     }
-    return {key: value for key, value in entries.items() if value is not None}
+    if origin is not None:
+        entries |= {"robot": origin.robot, "task": origin.task, "action_meaning": origin.action_meaning}
+        entries["control_rate_hz"] = origin.fps
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in entries.items()}
 
 
-def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
+def _entry(checkpoint: Checkpoint, key: str) -> dict[str, Any]:
     """Return the name, type and shape of an input or output, and what its numbers mean, if known."""
-    checkpoint, meta = policy.checkpoint, policy.checkpoint.origin
     if key.startswith(IMAGES):
         shape = ["batch", *checkpoint.pictures[key.removeprefix(IMAGES)], 3]
         return {"name": key, "dtype": "uint8", "shape": shape, "names": ["red", "green", "blue"], "units": "0 to 255"}
     size = checkpoint.action if key == ACTION else checkpoint.numbers[key]
-    names: list[str] = []
-    if meta:
-        names = list(meta.environment_state_names if key == ENVIRONMENT_STATE else meta.joint_names)
-    meaning = meta.action_meaning if meta else OPENINGS
-    grippers = [place % size for place in GRIPPERS.get(meaning, (-1,))]
-    units = [_JOINT_UNITS[meaning][place in grippers] for place in range(size)] if meaning in _JOINT_UNITS else []
+    entry = {"name": key, "dtype": "float32", "shape": ["batch", size]}
+    origin = checkpoint.origin
+    if origin is None:
+        return entry
     if key == ENVIRONMENT_STATE:
+        names = list(origin.environment_state_names)
         units = ["1" if _UNITLESS.fullmatch(name) else _UNITS.get(name.rpartition(".")[2]) for name in names]
-    meanings = {name: values for name, values in (("names", names), ("units", units)) if values}
-    return {"name": key, "dtype": "float32", "shape": ["batch", size], **meanings}
+        return entry | {"names": names, "units": units}
+    entry["names"] = list(origin.joint_names)
+    meaning = origin.action_meaning
+    if meaning in _JOINT_UNITS:
+        grippers = [place % size for place in GRIPPERS.get(meaning, LAST)]
+        entry["units"] = [_JOINT_UNITS[meaning][place in grippers] for place in range(size)]
+    return entry
 
 
-def _observations(policy: LearnedPolicy, function: PolicyFunction, rows: int) -> Arrays:
-    """Return random observations, distributed as in the training data."""
+def _random_observations(network: MLPNetwork, checkpoint: Checkpoint) -> tuple[F32, F32, Images]:
+    """Return joint states, environment states and pictures, distributed as in the training data."""
     rng = np.random.default_rng(0)
-    widths = [policy.checkpoint.numbers[key] for key in function.numbers]
-    network, size = function.network, sum(widths)
+    joints = checkpoint.numbers[STATE]
+    size = sum(checkpoint.numbers.values())
     mean, scale = network.input_mean[:size].numpy(), network.input_scale[:size].numpy()
     deviation = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
-    numbers = (mean + deviation * rng.normal(size=(rows, size))).astype(np.float32)
-    parts = np.split(numbers, np.cumsum(widths)[:-1], axis=1)
-    sizes = {key: policy.checkpoint.pictures[key.removeprefix(IMAGES)] for key in function.cameras}
-    pictures = {key: rng.integers(256, size=(rows, *size, 3), dtype=np.uint8) for key, size in sizes.items()}
-    return dict(zip(function.numbers, parts, strict=True)) | pictures
-
-
-def _actions(policy: LearnedPolicy, function: PolicyFunction, observation: Arrays) -> F64:
-    """Return the checkpoint's actions, (B, n)."""
-    images = {key.removeprefix(IMAGES): observation[key] for key in function.cameras}
-    around = observation.get(ENVIRONMENT_STATE, np.empty((len(observation[STATE]), 0), np.float32))
-    return policy.act(observation[STATE], around, images)
+    numbers = (mean + deviation * rng.normal(size=(_ROWS, size))).astype(np.float32)
+    pictures = {
+        camera: rng.integers(256, size=(_ROWS, *shape, 3), dtype=np.uint8)
+        for camera, shape in checkpoint.pictures.items()
+    }
+    return numbers[:, :joints], numbers[:, joints:], pictures

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from manip_il.errors import UsageError
-from manip_il.learn.names import CNN, CONVERTED, JOINT_TARGET, MLP
+from manip_il.learn.names import CNN, MLP
 from manip_il.option import check_bounds, option
 
 if TYPE_CHECKING:  # `checkpoint` imports numpy
@@ -91,7 +91,6 @@ class FitConfig:
             raise UsageError(
                 "--policy.path and --policy.type exclude each other: a checkpoint has its own type; give one of them"
             )
-        check_convertible(self.kind, self.action_space or JOINT_TARGET)
         if self.kind == MLP and self.takes_images:
             raise UsageError(
                 f"--observation={self.observes} needs a policy that takes images, unlike mlp; use --policy.type=cnn"
@@ -100,20 +99,12 @@ class FitConfig:
     @cached_property
     def start(self) -> Checkpoint | None:
         """The checkpoint in `policy.path`. Raises `ManipError` if it cannot be read."""
-        if "path" not in self.policy:
-            return None
-        from manip_il.learn.checkpoint import Checkpoint
+        return _open(Path(self.policy["path"])) if "path" in self.policy else None
 
-        return Checkpoint.open(Path(self.policy["path"]))
-
-    @property
+    @cached_property
     def initial(self) -> Checkpoint | None:
         """The checkpoint with the initial weights, in `policy.path` or `init_from`. Raises what `start` raises."""
-        if self.init_from is None:
-            return self.start
-        from manip_il.learn.checkpoint import Checkpoint
-
-        return Checkpoint.open(self.init_from)
+        return self.start if self.init_from is None else _open(self.init_from)
 
     @property
     def kind(self) -> str:
@@ -146,10 +137,7 @@ class FitConfig:
         return self.steps or self.defaults.steps
 
 
-def check_convertible(kind: str, space: str) -> None:
-    """Raise `UsageError` for a policy type that does not support an action space."""
-    if space != JOINT_TARGET and kind not in CONVERTED:
-        raise UsageError(
-            f"action_space is {space!r}, which --policy.type={kind} does not support; expected {JOINT_TARGET}, "
-            f"or --policy.type={', '.join(CONVERTED[:-1])} or {CONVERTED[-1]}"
-        )
+def _open(path: Path) -> Checkpoint:
+    from manip_il.learn.checkpoint import Checkpoint  # which imports numpy
+
+    return Checkpoint.open(path)

@@ -23,12 +23,16 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, JOINT_TARGETS, OPENINGS, STATE
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.checkpoint import require_trust
-from manip_il.learn.fit_config import FitConfig, check_convertible
-from manip_il.learn.names import JOINT_TARGET, OWN_SPACE
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.names import CONVERTED, JOINT_TARGET, OWN_SPACE
+from manip_il.learn.network import require_device
 
 PLUGINS = ("manip_il.learn.mlp", "manip_il.learn.cnn")
-# Options of LeRobot's policies that concern its Hub, its commands or one machine: not accepted here.
-NOT_OURS = ("push_to_hub", "repo_id", "private", "pretrained_path", "pretrained_revision", "use_peft")
+# Options of LeRobot's policies that concern its Hub, its commands or one machine, and one without effect.
+NOT_OURS = (
+    *("push_to_hub", "repo_id", "private", "pretrained_path", "pretrained_revision", "use_peft"),
+    "heatmap_weight",
+)
 
 
 @cache
@@ -58,20 +62,17 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
     The device is the GPU if there is one. Raises `UnknownName` for an unknown type or option, `UsageError` for a value
     that LeRobot refuses, `ManipError` if it names models that are not trusted.
     """
-    given = {name: value for name, value in fit.policy.items() if name not in ("type", "path")}
-    if str(given.get("device")).startswith("cuda") and not torch.cuda.is_available():  # LeRobot would switch devices
-        raise UsageError(f"--policy.device={given['device']}, but PyTorch finds no GPU here; expected cpu")
-    given.setdefault("device", "cuda" if torch.cuda.is_available() else "cpu")
-    source, options = f"--policy.type={fit.kind}", dict(given)
     cls = policy_class(fit.kind)
+    source, saved = f"--policy.type={fit.kind}", dict[str, Any]()
+    given = {name: value for name, value in fit.policy.items() if name not in ("type", "path")}
+    given.setdefault("device", "cuda" if torch.cuda.is_available() else "cpu")
+    require_device(str(given["device"]))  # LeRobot would switch devices
     if fit.start is not None:
-        source, saved = f"--policy.path={fit.start.path}", fit.start.config
-        options = {name: value for name, value in saved.items() if name not in ("type", *NOT_OURS)}
-        if "pretrained_backbone_weights" in saved:  # the checkpoint has the weights; torchvision would download its own
-            options["pretrained_backbone_weights"] = None
-        options |= given
+        source = f"--policy.path={fit.start.path}"
+        saved = {name: value for name, value in fit.start.options.items() if name not in NOT_OURS}
         if saved.get("states") and "states" not in given:  # a dataset's path, which only the user may name
             raise UsageError(f"{source} learnt from a dataset of states; give it again with --policy.states=DATASET")
+    options = saved | given
     require_trust({**options, "type": fit.kind}, source, fit.trust)
     config = typing.cast(PreTrainedConfig, decode(cls, options, source))
     config.push_to_hub = False  # LeRobot uploads by default; nothing leaves this machine unless asked to
@@ -190,5 +191,9 @@ def _action_space(policy: PreTrainedConfig, fit: FitConfig, meaning: str) -> str
     space = wanted or getattr(policy, "action_space", start.space if start else JOINT_TARGET)
     if start is not None and start.space != space:
         raise MismatchError("action space", f"the checkpoint {start.path}", start.space, "this fit", space)
-    check_convertible(policy.type, space)
+    if space != JOINT_TARGET and policy.type not in CONVERTED:
+        raise UsageError(
+            f"action_space is {space!r}, which --policy.type={policy.type} does not support; expected {JOINT_TARGET}, "
+            f"or --policy.type={', '.join(CONVERTED[:-1])} or {CONVERTED[-1]}"
+        )
     return space

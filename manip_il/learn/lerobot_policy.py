@@ -27,28 +27,37 @@ _DEVICE_STEP = "device_processor"
 _SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less variation than this in all of the data is noise
 
 
-def build_policy(config: PreTrainedConfig, meta: Any, resumed: Path | None = None) -> PreTrainedPolicy:
-    """Return a LeRobot policy with new weights, those in `config.pretrained_path`, or those of the run to resume.
+def build_policy(config: PreTrainedConfig, meta: Any, resumed: Checkpoint | None = None) -> PreTrainedPolicy:
+    """Return a LeRobot policy for training.
 
     An mlp that starts from another mlp's weights takes input statistics from the new data, see `warm_start`; a cnn
-    takes the range of its actions from the new data. Raises `ManipError` for a checkpoint that cannot be loaded, and
-    if a backbone's weights cannot be downloaded.
+    takes the range of its actions from the new data.
+
+    Args:
+        config: The policy's options. The weights are those in its `pretrained_path`, else new.
+        meta: The metadata of the training data.
+        resumed: The checkpoint of a run to continue, whose weights count instead.
+
+    Raises:
+        ManipError: A checkpoint cannot be loaded, or a backbone's weights cannot be downloaded.
     """
     start, weights = config.pretrained_path, getattr(config, "pretrained_backbone_weights", None)
-    warm = config.type == MLP and start is not None and resumed is None
-    config.pretrained_path = None if warm else resumed or start
+    if resumed is not None:
+        start = None
+        config.pretrained_path = resumed.path
+    if start is not None and config.type == MLP:
+        config.pretrained_path = None  # `warm_start` loads it
     what = f"{config.pretrained_path} does not fit this policy"
     if config.pretrained_path is None:
         what = f"cannot build --policy.type={config.type}"
     if weights:
         what += f" with --policy.pretrained_backbone_weights={weights} (offline, use null)"
     with _lerobot(what):
-        policy = make_policy(config, ds_meta=meta)
-    own: Any = policy
-    if warm:
-        warm_start(own.model, Path(str(start)))
-    elif config.type == CNN and start is not None and resumed is None:  # acts within the range of the new data
-        own.model.target_low, own.model.target_high = own.target_range
+        policy: Any = make_policy(config, ds_meta=meta)
+    if start is not None and config.type == MLP:
+        warm_start(policy.model, Path(start))
+    if start is not None and config.type == CNN:  # acts within the range of the new data
+        policy.model.target_low, policy.model.target_high = policy.target_range
     if weights:  # the checkpoint will have all weights, so loading it needs no network
         config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
     config.pretrained_path = None
@@ -106,14 +115,10 @@ def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tup
     not trusted, or if LeRobot cannot load the folder.
     """
     cls = policy_class(checkpoint.kind)
-    own = {key: value for key, value in checkpoint.config.items() if key != "type"}
     checkpoint.require_trust(trust)
     with _lerobot(f"{checkpoint.path}: LeRobot cannot load it"):
         # not `PreTrainedConfig.from_pretrained`, which leaves a temporary file behind each time
-        config = draccus.decode(cls, own | {"device": device})
-        # The weights come from the checkpoint; torchvision would download its own first.
-        if hasattr(config, "pretrained_backbone_weights"):
-            config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
+        config = draccus.decode(cls, checkpoint.options | {"device": device})
         processors = load_processors(checkpoint, config, trust=trust)
         policy = get_policy_class(checkpoint.kind).from_pretrained(checkpoint.path, config=config, strict=True)
         return policy, *processors

@@ -11,7 +11,6 @@ Acting is deterministic: one action per state. `mse` and `l1` do not model the s
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from typing import override
 
 import torch
@@ -24,22 +23,23 @@ LOSSES = ("mse", "l1", "gaussian", "mixture", "categorical")
 # floor, 2 % of a target's standard deviation in the data, keeps the gradients finite.
 MIN_LOG_STD = -4.0
 _REACH = 3.0  # half-width of a smeared target [standard deviations]
+_LEAST_SIGMA = 0.1  # least smearing of a target [bins]
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
-class Head(ABC):
+class Head:
     """A family of action distributions. n: numbers in an action. size: parameters per row."""
 
     n: int
     size: int
 
-    @abstractmethod
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
         """Return the loss of each row, (B,), from params (B, size) and target (B, n)."""
+        raise NotImplementedError
 
-    @abstractmethod
     def action(self, params: Tensor) -> Tensor:
-        """Return the action of each row, (B, n)."""
+        """Return the action of each row, (B, n): by default the parameters themselves."""
+        return params
 
 
 class MSEHead(Head):
@@ -51,10 +51,6 @@ class MSEHead(Head):
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
         return (params - target).square().mean(-1)
-
-    @override
-    def action(self, params: Tensor) -> Tensor:
-        return params
 
 
 class L1Head(MSEHead):
@@ -82,10 +78,6 @@ class GaussianHead(Head, nn.Module):
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
         return -_normal_log_prob(target, params, floored_log_std(self.raw_log_std)).sum(-1)
-
-    @override
-    def action(self, params: Tensor) -> Tensor:
-        return params
 
 
 class MixtureHead(Head):
@@ -123,42 +115,35 @@ class MixtureHead(Head):
 class CategoricalHead(Head):
     """Cross-entropy over `bins` equal bins from -1 to 1, the range of the data, for each dimension.
 
-    A target is smeared over the bins by a Gaussian of `sigma` bins around it (HL-Gauss: Farebrother et al., Stop
-    regressing, ICML 2024, section 3.1), so that neighbouring bins count as near. `pad` bins of the same width at
-    either end hold what is smeared past the range; without them a target at the end of the range would be
-    pulled inwards. With `sigma` 0 there are no such bins, and a target is split between the two nearest bin
-    centres (two-hot, as in Schrittwieser et al., MuZero, 2020, appendix F). Either way the expectation over the bin
-    centres is the target.
+    A target is smeared over the bins by a Gaussian of `sigma` bins around it (HL-Gauss: Farebrother
+    et al., Stop regressing, ICML 2024, section 3.1), so that neighbouring bins count as near. `pad`
+    bins of the same width at either end hold what is smeared past the range; without them a target
+    at the end of the range would be pulled inwards. The expectation over the bin centres is the
+    target. With a sigma of 0 there is no padding, and nearly all of a target is in the nearest bin.
 
-    Acts with the expectation over the likeliest bin and the max(1, `pad`) bins on either side of it: exact within a
-    bin, unlike the argmax, and never between two separate modes, unlike the expectation over all bins.
+    Acts with the expectation over the likeliest bin and the max(1, `pad`) bins on either side of it:
+    exact within a bin, unlike the argmax, and never between two separate modes, unlike the
+    expectation over all bins.
     """
 
-    def __init__(self, n: int, bins: int, sigma: float = 0.0) -> None:
+    def __init__(self, n: int, bins: int, sigma: float) -> None:
         self.n = n
         self.bins = bins
-        self.sigma = sigma
+        self.sigma = max(sigma, _LEAST_SIGMA)
         self.pad = math.ceil(_REACH * sigma)
         self.total = bins + 2 * self.pad
         self.size = n * self.total
 
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
-        log_prob = self._logits(params).log_softmax(-1)
-        if self.sigma:
-            return -(self.smeared(target) * log_prob).sum((-2, -1))
-        place = self._place(target)
-        lower = place.floor().clamp(max=self.total - 2)
-        upper_share = place - lower
-        index = lower.long().unsqueeze(-1)
-        at_lower = log_prob.gather(-1, index).squeeze(-1)
-        at_upper = log_prob.gather(-1, index + 1).squeeze(-1)
-        return -((1.0 - upper_share) * at_lower + upper_share * at_upper).sum(-1)
+        return -(self.smeared(target) * self._logits(params).log_softmax(-1)).sum((-2, -1))
 
     def smeared(self, target: Tensor) -> Tensor:
         """Return the share of each target (B, n) in each bin, (B, n, bins + 2 pad), under its Gaussian."""
+        # targets, clamped to the data's range, in bins from the first centre
+        place = (target.clamp(-1.0, 1.0) + 1.0) * (0.5 * (self.bins - 1)) + self.pad
         edges = torch.arange(self.total + 1, dtype=target.dtype, device=target.device) - 0.5
-        below = torch.special.ndtr((edges - self._place(target).unsqueeze(-1)) / self.sigma)
+        below = torch.special.ndtr((edges - place.unsqueeze(-1)) / self.sigma)
         # The ends are at least 3 sigma from any target, so the sum is never 0.
         return below.diff(dim=-1) / (below[..., -1:] - below[..., :1])
 
@@ -169,21 +154,23 @@ class CategoricalHead(Head):
         inside = (near >= 0) & (near < self.total)
         near = near.clamp(0, self.total - 1)
         weights = logits.gather(-1, near).masked_fill(~inside, -torch.inf).softmax(-1)
-        return (weights * self._centres(near, params)).sum(-1)
-
-    def _place(self, target: Tensor) -> Tensor:
-        """Return targets, clamped to the data's range, in bins from the first centre."""
-        return (target.clamp(-1.0, 1.0) + 1.0) * (0.5 * (self.bins - 1)) + self.pad
-
-    def _centres(self, bins: Tensor, params: Tensor) -> Tensor:
-        return (bins.to(params.dtype) - self.pad) * (2.0 / (self.bins - 1)) - 1.0
+        centres = (near.to(params.dtype) - self.pad) * (2.0 / (self.bins - 1)) - 1.0
+        return (weights * centres).sum(-1)
 
     def _logits(self, params: Tensor) -> Tensor:
         return params.reshape(*params.shape[:-1], self.n, self.total)
 
 
-def make_head(loss: str, n: int, *, components: int, bins: int, sigma: float = 0.0) -> Head:
-    """Return the head for a name in `LOSSES`. sigma: standard deviation of the smearing in `categorical` [bins]."""
+def make_head(loss: str, n: int, *, components: int, bins: int, sigma: float) -> Head:
+    """Return a new head.
+
+    Args:
+        loss: A name in `LOSSES`.
+        n: Numbers in an action.
+        components: Gaussians in `mixture`.
+        bins: Bins per dimension in `categorical`.
+        sigma: Standard deviation of a smeared target in `categorical` [bins].
+    """
     heads: dict[str, Head] = {
         "mse": MSEHead(n),
         "l1": L1Head(n),

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, override
 
 import torch
@@ -21,12 +20,11 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from manip_il.data.dataset import joined_columns
-from manip_il.data.lerobot_layout import INDEX
+from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, UsageError
 from manip_il.learn.names import EE_DELTA
-from manip_il.learn.network import MLPNetwork, Shape, fit_statistics
+from manip_il.learn.network import MLPNetwork, NetworkConfig
 from manip_il.learn.samples import Table, valid_frames
 
 __path__: list[str] = []
@@ -53,10 +51,8 @@ class WarmUpAndCosineConfig(LRSchedulerConfig):
 
 @PreTrainedConfig.register_subclass("mlp")
 @dataclass
-class MLPConfig(Shape, PreTrainedConfig):
-    """A multi-layer perceptron from joint and environment state to one action; its options are those of `Shape`.
-
-    A configuration with features but no sigma was saved before sigma existed, so its sigma is 0.
+class MLPConfig(NetworkConfig, PreTrainedConfig):
+    """A multi-layer perceptron from joint and environment state to one action; its options are those of its network.
 
     The network needs raw inputs (its targets may be relative to the measured joints), so LeRobot's
     normaliser steps are the identity and the statistics are buffers of the model.
@@ -75,19 +71,18 @@ class MLPConfig(Shape, PreTrainedConfig):
 
     def __post_init__(self) -> None:
         PreTrainedConfig.__post_init__(self)
-        if self.sigma is None and self.input_features:
-            self.sigma = 0.0
-        Shape.__post_init__(self)
+        NetworkConfig.__post_init__(self)
 
     @override
     def validate_features(self) -> None:
         """Raise unless `observation.state` and `action` exist and have the same size."""
         state, action = self.robot_state_feature, self.action_feature
-        if state is None or action is None:
-            have = ", ".join([*(self.input_features or {}), *(self.output_features or {})])
-            raise UsageError(f"the {self.type} policy needs observation.state and action; the features are {have}")
-        if len(state.shape) != 1 or state.shape != action.shape:
-            raise MismatchError("shape", "observation.state", state.shape, "action", action.shape)
+        shapes = [None if feature is None else feature.shape for feature in (state, action)]
+        if shapes[0] is None or len(shapes[0]) != 1 or shapes[0] != shapes[1]:
+            raise UsageError(
+                f"the {self.type} policy needs observation.state and action of the same size; their shapes are "
+                f"{shapes[0]} and {shapes[1]}"
+            )
 
     @override
     def get_optimizer_preset(self) -> AdamWConfig:
@@ -104,8 +99,10 @@ class MLPPolicy(PreTrainedPolicy):
     Batches hold `observation.state` (B, n), `observation.environment_state` (B, k) and, in training,
     `action` (B, n), all raw ([rad], [m]).
 
-    dataset_meta: for training, LeRobot's metadata, which `make_policy` passes on; it may have a `table` of columns that
-    have been read already. The statistics are then computed from the frames with a valid label.
+    Args:
+        config: The options, with features.
+        dataset_meta: For training, LeRobot's metadata, which `make_policy` passes on; see `training_table`.
+            The statistics are then computed from the frames with a valid label.
     """
 
     config_class = MLPConfig  # type: ignore[assignment]
@@ -117,10 +114,11 @@ class MLPPolicy(PreTrainedPolicy):
         config.validate_features()
         self.inputs = [key for key in (STATE, ENVIRONMENT_STATE) if key in (config.input_features or {})]
         if config.scales and not config.scaled and dataset_meta is not None:
-            config.scaled = self._offsets(config, dataset_meta.features)
+            reads = ENVIRONMENT_STATE in self.inputs or getattr(config, "aux_weight", 0) > 0
+            config.scaled = self._offsets(offsets_of(dataset_meta.features if reads else {}))
         self._build(config)
         if dataset_meta is not None:
-            self._learn_columns(self._columns(config, dataset_meta))
+            self._learn_statistics(training_table(config, dataset_meta), dataset_meta)
             self.target_range = self.model.target_low.clone(), self.model.target_high.clone()
 
     @override
@@ -154,49 +152,47 @@ class MLPPolicy(PreTrainedPolicy):
         width = sum(features[key].shape[0] for key in self.inputs)
         self.model = MLPNetwork(width, features[STATE].shape[0], config)
 
-    def _offsets(self, config: MLPConfig, features: Any) -> tuple[int, ...]:
-        """Return the indices of the inputs that are offsets between two things."""
-        n = (config.input_features or {})[STATE].shape[0]
-        return tuple(n + i for i in offsets_of(features if ENVIRONMENT_STATE in self.inputs else {}))
-
-    def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
-        targets = self.model.encode_targets(self.model.relative(batch[ACTION], inputs))
-        return self.model.row_losses(self.model.encode(inputs), targets)
+    def _offsets(self, places: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the indices among the inputs of these numbers of the environment state."""
+        n = (self.config.input_features or {})[STATE].shape[0]
+        return tuple(n + place for place in places)
 
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
         """Return the network's inputs (B, d) for a batch of observations."""
         return torch.cat([batch[key] for key in self.inputs], dim=-1)
 
-    def _columns(self, config: MLPConfig, dataset_meta: Any) -> Table:
-        """Return the columns of the training data; read those that have not been read yet."""
-        table = dict(getattr(dataset_meta, "table", {}))
-        if config.action_space == EE_DELTA and not table:
-            raise ManipError(
-                f"{EE_DELTA} needs the robot's kinematics, which LeRobot does not have; train with manip-il train"
-            )
-        wanted = [key for key in (*self.inputs, ACTION, LABEL_VALID, *self._more_columns()) if key not in table]
-        if names := [key for key in wanted if key in dataset_meta.features]:
-            table |= joined_columns(self._roots(dataset_meta), [*names, INDEX])
-            for key in names:
-                table[key] = table[key].reshape(len(table[key]), -1)  # as `load_data` does
+    def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
+        return self.model.row_losses(inputs, batch[ACTION])
+
+    def _learn_statistics(self, table: Table, dataset_meta: Any) -> None:
+        """Compute the network's statistics from the labelled frames of a training table."""
+        self.model.learn_statistics(*labelled(table, self.inputs))
+
+
+def training_table(config: MLPConfig, dataset_meta: Any) -> Table:
+    """Return the columns of the training data, (N, d) each.
+
+    `manip-il train` has read them already (`dataset_meta.table`); for `lerobot-train` they are read here. Raises
+    `ManipError` for an action space that only `manip-il train` converts to.
+    """
+    if (table := getattr(dataset_meta, "table", None)) is not None:
         return table
+    if config.action_space == EE_DELTA:
+        raise ManipError(
+            f"{EE_DELTA} needs the robot's kinematics, which LeRobot does not have; train with manip-il train"
+        )
+    names = [key for key in (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID) if key in dataset_meta.features]
+    columns = Dataset.open(dataset_meta.root).columns(names)
+    return {key: column.reshape(len(column), -1) for key, column in columns.items()}
 
-    def _roots(self, dataset_meta: Any) -> Sequence[Path]:
-        """Return the folders of the training data."""
-        return getattr(dataset_meta, "roots", ()) or (dataset_meta.root,)
 
-    def _more_columns(self) -> Sequence[str]:
-        """Return the columns that training needs in addition to the mlp's."""
-        return ()
-
-    def _learn_columns(self, columns: Table) -> None:
-        """Compute statistics from a dataset's columns."""
-        valid = torch.from_numpy(valid_frames(columns))
-        seen = torch.cat([torch.from_numpy(columns[key])[valid] for key in self.inputs], dim=1).float()
-        actions = torch.from_numpy(columns[ACTION])[valid].float()
-        targets = self.model.relative(actions, seen)
-        inputs = self.model.expanded(seen).numpy()
-        self.model.set_statistics(fit_statistics(inputs, targets.numpy(), self.model.loss))
+def labelled(table: Table, inputs: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """Return the joined columns `inputs`, (S, d), and the actions, (S, n), of the frames with a valid label."""
+    valid = torch.from_numpy(valid_frames(table))
+    seen, actions = (
+        torch.cat([torch.from_numpy(table[key])[valid] for key in keys], dim=1).float() for keys in (inputs, [ACTION])
+    )
+    return seen, actions
 
 
 def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:

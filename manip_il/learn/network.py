@@ -18,9 +18,9 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from manip_il.checks import native_path
-from manip_il.errors import MismatchError, UnknownName, UsageError
+from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.action_spaces import LAST
-from manip_il.learn.checkpoint import MOST_VALUES, WEIGHTS, in_one_line
+from manip_il.learn.checkpoint import WEIGHTS, in_one_line
 from manip_il.learn.losses import LOSSES, make_head
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
 from manip_il.mdp import F32, F64
@@ -30,7 +30,6 @@ from manip_il.option import check_bounds, option
 # multiplies this many rows, padded with zeros.
 ROWS = 64
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "gelu": nn.GELU, "silu": nn.SiLU}
-SIGMA = 3.0  # [bins]
 # [rad] or [m]. An input that moves less than this in all of the data is noise that division by its
 # deviation would amplify: it is multiplied by zero instead, so the network never sees it.
 CONSTANT_INPUT = 1e-4
@@ -38,26 +37,38 @@ CONSTANT_TARGET = 1e-6
 
 
 @dataclass
-class Shape:
+class NetworkConfig:
     """Sizes and kinds that a network is built from: the options of the `mlp` policy, and so of `MLPConfig`.
 
-    loss: one of `LOSSES`. components: Gaussians in `mixture`. bins: bins per dimension in `categorical`, over the range
-    of the data. sigma: standard deviation of a smeared target in `categorical` [bins]; 0: split between the two nearest
-    bins. clamp: bound on the normalised inputs, in standard deviations, so that states far from the data cannot blow up
-    the outputs. action_space: one of `manip_il.learn.action_spaces`. scales: lengths s [m]; for every offset x among
-    the inputs (`object_from_ee.x`, ...), tanh(x / s) is an input, too. scaled: indices of these offsets, taken from the
-    dataset. grippers: indices of the gripper openings, which are absolute in `joint_delta`, taken from the robot.
+    Args:
+        width: Units per layer.
+        depth: Hidden layers.
+        activation: One of `ACTIVATIONS`.
+        loss: One of `LOSSES`.
+        components: Gaussians in `mixture`.
+        bins: Bins per dimension in `categorical`, over the range of the data.
+        sigma: Standard deviation of a smeared target in `categorical` [bins].
+        clamp: Bound on the normalised inputs, in standard deviations, so that states far from the
+            data cannot blow up the outputs.
+        action_space: One of `manip_il.learn.action_spaces`.
+        scales: Lengths s [m]. For every offset x among the inputs (`object_from_ee.x`, ...),
+            tanh(x / s) is an input, too.
+        scaled: Indices of these offsets, taken from the dataset.
+        grippers: Indices of the gripper openings, which are absolute in `joint_delta`, taken from
+            the robot.
 
-    Raises `UnknownName` for an unknown loss or activation, `UsageError` for a size out of range.
+    Raises:
+        UnknownName: The loss, the activation or the action space is unknown.
+        UsageError: A size is out of range.
     """
 
-    width: int = option(256, "units per layer", at_least=1, at_most=4096)
-    depth: int = option(3, "hidden layers", at_least=1, at_most=32)
+    width: int = option(256, "units per layer", at_least=1)
+    depth: int = option(3, "hidden layers", at_least=1)
     activation: str = "silu"
     loss: str = "l1"
-    components: int = option(5, "Gaussians in a mixture", at_least=1, at_most=1000)
-    bins: int = option(21, "bins per dimension", at_least=2, at_most=1000)
-    sigma: float | None = option(None, "smearing of categorical targets [bins]; by default 3", at_least=0)
+    components: int = option(5, "Gaussians in a mixture", at_least=1)
+    bins: int = option(21, "bins per dimension", at_least=2)
+    sigma: float = option(3.0, "smearing of categorical targets [bins]", at_least=0)
     clamp: float = option(10.0, "bound on the inputs [standard deviations]", at_least=1e-9)
     action_space: str = JOINT_DELTA
     scales: tuple[float, ...] = ()
@@ -65,25 +76,18 @@ class Shape:
     grippers: tuple[int, ...] = LAST
 
     def __post_init__(self) -> None:
-        self.sigma = SIGMA if self.sigma is None else self.sigma
-        self.scales = tuple(self.scales)
-        self.scaled = tuple(self.scaled)
-        self.grippers = tuple(self.grippers)
         check_bounds(self, "policy.")
-        for name, known in (("loss", LOSSES), ("activation", ACTIVATIONS), ("action_space", ACTION_SPACES)):
-            if (value := getattr(self, name)) not in known:
-                raise UnknownName(name, str(value), known)
+        known_names = {"loss": LOSSES, "activation": ACTIVATIONS, "action_space": ACTION_SPACES}
+        for name, known in known_names.items():
+            if getattr(self, name) not in known:
+                raise UnknownName(name, str(getattr(self, name)), known)
         if not all(scale > 0 for scale in self.scales):
             raise UsageError(f"policy.scales is {list(self.scales)}; expected lengths of more than 0")
-        if (added := len(self.scales) * len(self.scaled)) > MOST_VALUES:
-            raise UsageError(f"policy.scales adds {added:,} inputs; expected at most {MOST_VALUES:,}")
 
     @classmethod
-    def of(cls, config: Mapping[str, Any]) -> Shape:
-        """Return the shape in a policy's `config.json`; sigma is 0 in a file from before sigma existed."""
-        given: dict[str, Any] = {"sigma": 0.0}
-        given |= {one.name: config[one.name] for one in fields(Shape) if one.name in config}
-        return cls(**given)
+    def of(cls, config: Mapping[str, Any]) -> NetworkConfig:
+        """Return the options among those of a policy, as in its `config.json`."""
+        return cls(**{one.name: config[one.name] for one in fields(cls) if one.name in config})
 
 
 Statistics = Mapping[str, Tensor]  # named as the buffers of `MLPNetwork`
@@ -141,21 +145,21 @@ class MLPNetwork(nn.Module):
     target_low: Tensor
     target_high: Tensor
 
-    def __init__(self, inputs: int, n: int, shape: Shape) -> None:
+    def __init__(self, inputs: int, n: int, config: NetworkConfig) -> None:
         super().__init__()
         self.n = n
-        self.clamp = shape.clamp
-        self.loss = shape.loss
-        added = torch.full((n,), float(shape.action_space == JOINT_DELTA))
-        added[list(shape.grippers)] = 0.0
+        self.clamp = config.clamp
+        self.loss = config.loss
+        added = torch.full((n,), float(config.action_space == JOINT_DELTA))
+        added[list(config.grippers)] = 0.0
         self.register_buffer("added", added, persistent=False)
-        self.scales = shape.scales
-        self.scaled = list(shape.scaled)
+        self.scales = config.scales
+        self.scaled = list(config.scaled)
         self.inputs = inputs
-        inputs += len(shape.scales) * len(shape.scaled)
-        self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins, sigma=shape.sigma or 0.0)
-        activation = ACTIVATIONS[shape.activation]
-        self.layers = perceptron(inputs, shape.width, shape.depth, self.head.size, activation)
+        inputs += len(self.scales) * len(self.scaled)
+        self.head = make_head(config.loss, n, components=config.components, bins=config.bins, sigma=config.sigma)
+        activation = ACTIVATIONS[config.activation]
+        self.layers = perceptron(inputs, config.width, config.depth, self.head.size, activation)
         for name, size in (("input", inputs), ("target", n)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
@@ -166,6 +170,11 @@ class MLPNetwork(nn.Module):
         """Set the statistics of the data. Inputs beyond the length of `statistics` keep mean 0 and scale 1."""
         for name, tensor in statistics.items():
             getattr(self, name)[: len(tensor)].copy_(tensor)
+
+    def learn_statistics(self, inputs: Tensor, actions: Tensor) -> None:
+        """Set the statistics to those of raw inputs (N, n + k) and absolute actions (N, n)."""
+        targets = self.relative(actions, inputs).numpy()
+        self.set_statistics(fit_statistics(self.expanded(inputs).numpy(), targets, self.loss))
 
     def expanded(self, inputs: Tensor) -> Tensor:
         """Return inputs (B, n + k) with tanh(offset / scale) appended for each scale, so that millimetres matter."""
@@ -182,9 +191,10 @@ class MLPNetwork(nn.Module):
         inverse = torch.where(self.target_scale > 0, 1.0 / self.target_scale, torch.zeros_like(self.target_scale))
         return (targets - self.target_mean) * inverse
 
-    def row_losses(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return the loss of each row, (B,), from encoded inputs and targets."""
-        return self.head.nll(self.layers(x), y)
+    def row_losses(self, inputs: Tensor, actions: Tensor) -> Tensor:
+        """Return the loss of each row, (B,), for raw inputs (B, n + k) and absolute actions (B, n)."""
+        targets = self.encode_targets(self.relative(actions, inputs))
+        return self.head.nll(self.layers(self.encode(inputs)), targets)
 
     def relative(self, actions: Tensor, inputs: Tensor) -> Tensor:
         """Return absolute actions (B, n) minus the measured joints that the network adds to its output."""
@@ -217,6 +227,12 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def require_device(device: str) -> None:
+    """Raise `UsageError` for a GPU if PyTorch finds none."""
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise UsageError(f"device is {device!r}, but PyTorch finds no GPU here; expected 'cpu'")
+
+
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
     """Return weights (n, d) and statistics (n,) by name from a folder; `ManipError` if they cannot be read."""
     path = Path(pretrained_model) / WEIGHTS
@@ -231,20 +247,16 @@ def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
     The input statistics stay those of the new data: the first layer compensates for the difference. (An
     input normaliser frozen at the first round of DAgger puts later rounds' states out of scale.)
     The range of the targets is also that of the new data; their mean and scale are copied, as they are
-    only the unit of the outputs. Raises `MismatchError` if shapes differ, `ManipError` for a file that cannot be read.
+    only the unit of the outputs. Raises `ManipError` for a file that cannot be read or does not fit.
     """
-    saved = read_weights(pretrained_model)
-    kept = {name: getattr(network, name).clone() for name in ("input_mean", "input_scale", "target_low", "target_high")}
-    for name, ours in network.state_dict().items():
-        theirs = saved[name].shape if name in saved else None
-        if theirs != ours.shape:
-            raise MismatchError(f"{name}'s shape", str(pretrained_model), theirs, "the new network", tuple(ours.shape))
-    network.load_state_dict(saved)
+    of_new_data = ("input_mean", "input_scale", "target_low", "target_high")
+    kept = {name: getattr(network, name).clone() for name in of_new_data}
+    with in_one_line(f"the weights in {pretrained_model} do not fit the new network"):
+        network.load_state_dict(read_weights(pretrained_model))
     # x_old = (u - mean_old) scale_old and x = (u - mean) scale, so x_old = x scale_old / scale + offset
     first = network.layers[0]
     assert isinstance(first, torch.nn.Linear)
     offset, scale = (kept["input_mean"] - network.input_mean) * network.input_scale, kept["input_scale"]
     first.bias.add_(first.weight @ offset)
     first.weight.mul_(torch.where(scale > 0, network.input_scale / scale, torch.zeros_like(scale)))
-    for name, tensor in kept.items():
-        getattr(network, name).copy_(tensor)
+    network.set_statistics(kept)

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
-from manip_il.errors import MismatchError, NotFiniteError, UsageError
+from manip_il.errors import MismatchError, NotFiniteError
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import CONFIG, Checkpoint, in_one_line
 from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
-from manip_il.learn.network import MLPNetwork, Shape, read_weights, threads
+from manip_il.learn.network import MLPNetwork, NetworkConfig, read_weights, require_device, threads
 from manip_il.mdp import F32, F64, I64, Images
 
 if TYPE_CHECKING:  # `episode_policy` imports LeRobot, which takes seconds
@@ -42,15 +42,13 @@ class LearnedPolicy:
         that the checkpoint names. Raises what `Checkpoint.open` raises, `ManipError` for files that do not match or,
         without `trust`, that name models to load; `UnknownName` for an unknown type of policy.
         """
-        if device.startswith("cuda") and not torch.cuda.is_available():
-            raise UsageError(f"device is {device!r}, but PyTorch finds no GPU here; expected 'cpu'")
+        require_device(device)
         opened = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint.open(checkpoint)
         if opened.kind == MLP:
             return cls(_Perceptron(opened, device), opened)
         from manip_il.learn.episode_policy import EpisodePolicy
-        from manip_il.learn.lerobot_policy import load_policy
 
-        return cls(EpisodePolicy(*load_policy(opened, device, trust), task), opened)
+        return cls(EpisodePolicy(opened, device, task, trust), opened)
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -95,8 +93,8 @@ class LearnedPolicy:
     def _numbers(self, states: F32, environment_states: F32) -> Batch:
         given = {STATE: states, ENVIRONMENT_STATE: environment_states}
         return {
-            key: torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
-            for key, values in given.items()
+            key: torch.from_numpy(np.ascontiguousarray(given[key], dtype=np.float32))
+            for key in given
             if key in self.checkpoint.numbers
         }
 
@@ -119,9 +117,9 @@ def actions_along(policy: LearnedPolicy, table: Mapping[str, NDArray[Any]]) -> I
     table: columns `observation.state`, `observation.environment_state` and `episode_index`, one episode after another.
     """
     episodes = table[EPISODE_INDEX].reshape(-1)
-    starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1))
-    steps = np.arange(len(episodes)) - np.repeat(starts, np.diff(starts, append=len(episodes)))
-    for step in range(int(steps.max()) + 1):  # in order, for policies with a memory
+    _, lengths = np.unique(episodes, return_counts=True)
+    steps = np.concatenate([*map(np.arange, lengths)])
+    for step in range(lengths.max()):  # in order, for policies with a memory
         rows = np.flatnonzero(steps == step)
         yield rows, policy.act(table[STATE][rows], table[ENVIRONMENT_STATE][rows], {}, episodes[rows].tolist())
 
@@ -134,7 +132,7 @@ class _Perceptron:
         self._keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in checkpoint.numbers]
         width = sum(checkpoint.numbers[key] for key in self._keys)
         with in_one_line(f"{checkpoint.path}: weights and {CONFIG} do not match"):
-            self.module = MLPNetwork(width, checkpoint.action, Shape.of(checkpoint.config))
+            self.module = MLPNetwork(width, checkpoint.action, NetworkConfig.of(checkpoint.config))
             self.module.load_state_dict(read_weights(checkpoint.path))
         self.module.to(device).eval()
         space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # the network converts joint_delta

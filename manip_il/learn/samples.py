@@ -21,7 +21,7 @@ from manip_il.data.camera import decode
 from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.joined import JoinedDatasets
 from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, TASK_INDEX, TIMESTAMP
-from manip_il.data.schema import ACTION, LABEL_VALID, STATE
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.checkpoint import in_one_line
@@ -92,15 +92,13 @@ class Samples:
     """Samples in memory; a batch is one gather per column.
 
     columns: numeric columns, (N, d) or (N,), by LeRobot's names. pictures: camera column -> uint8 (N, 3, H, W). tasks:
-    text of every `task_index`, (M,). table: the numeric columns as arrays, also those that are not inputs. train,
-    held_out: rows of the samples to train on and to validate with, (S,) each.
+    text of every `task_index`, (M,). train, held_out: rows of the samples to train on and to validate with, (S,) each.
     """
 
     windows: Windows
     columns: dict[str, torch.Tensor]
     pictures: dict[str, NDArray[np.uint8]]
     tasks: NDArray[np.object_]
-    table: Table
     train: I64
     held_out: I64
 
@@ -125,17 +123,28 @@ def load_data(
     encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]] | None = None,
     on_frames: Callable[[int], None] | None = None,
 ) -> Samples:
-    """Return the samples of the concatenated datasets for a policy whose features have been set.
+    """Return the samples of the concatenated datasets.
 
-    meta: the datasets; its statistics become those of the encoded actions. encode: maps actions (N, n) and states
-    (N, n) to targets; None if the targets are the datasets' actions. on_frames: called with the number of newly
-    decoded frames. Raises `NotFiniteError` and what `Windows.usable` raises.
+    Args:
+        policy: The policy's options, with features.
+        meta: The datasets. Its `table` becomes the numeric columns, and its statistics those of the encoded actions.
+        eval_split: Share of the episodes that are held out.
+        seed: Decides which episodes are held out.
+        encode: Maps actions (N, n) and states (N, n) to targets; None if the targets are the datasets' actions.
+        on_frames: Called with the number of newly decoded frames.
+
+    Raises:
+        NotFiniteError: A column holds a number that is not finite.
+        ManipError: No frame has a valid label in its whole window.
     """
-    features = [key for key in (*(policy.input_features or {}), ACTION) if key in meta.features]
+    wanted = [*(policy.input_features or {}), ACTION]
+    if getattr(policy, "aux_weight", 0) and ENVIRONMENT_STATE not in wanted:  # the cnn predicts it
+        wanted.append(ENVIRONMENT_STATE)
+    features = [key for key in wanted if key in meta.features]
     cameras = [key for key in features if key in meta.camera_keys]
     numbers = [key for key in features if key not in cameras]
-    table = joined_columns(meta.roots, [*numbers, *_ALWAYS])
-    table[LABEL_VALID] = np.concatenate([_label_valid(one) for one in meta.datasets])
+    table = joined_columns(meta.datasets, [*numbers, *_ALWAYS])
+    table[LABEL_VALID] = np.concatenate([_label_valid(dataset) for dataset in meta.datasets])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     for key in numbers:
         table[key] = table[key].reshape(len(table[key]), -1)  # a column with one number per frame becomes a vector, too
@@ -143,6 +152,7 @@ def load_data(
     if encode is not None:
         table[ACTION] = encode(table[ACTION].astype(np.float32), table[STATE])
         meta.stats |= column_statistics({ACTION: table[ACTION]})
+    meta.table = table
     episodes = table[EPISODE_INDEX].astype(np.int64)
     windows = windows_of(policy, features, episodes)
     usable = windows.usable(valid_frames(table), getattr(policy, "drop_n_last_frames", 0))
@@ -152,9 +162,8 @@ def load_data(
     return Samples(
         windows,
         {key: torch.from_numpy(table[key]) for key in (*numbers, *_ALWAYS)},
-        {key: decode([one.camera(key) for one in meta.datasets], on_frames) for key in cameras},
+        {key: decode([dataset.camera(key) for dataset in meta.datasets], on_frames) for key in cameras},
         np.array(meta.tasks, object),
-        table,
         usable[train],
         usable[held_out],
     )

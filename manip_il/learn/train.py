@@ -12,6 +12,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ from manip_il.learn.lerobot_config import lerobot_options, set_features
 from manip_il.learn.lerobot_policy import build_policy, build_processors, load_processors
 from manip_il.learn.names import OWN_SPACE, PLAIN
 from manip_il.learn.network import threads
-from manip_il.learn.samples import I64, Batch, load_data
+from manip_il.learn.samples import Batch, Samples, load_data
 from manip_il.learn.sources import check_same_sources, input_columns, recorded_look, row_weights
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
@@ -50,22 +51,33 @@ from manip_il.learn.training_state import (
     read_step,
     write_own_files,
 )
-from manip_il.mdp import F64
+from manip_il.mdp import F64, I64
 
 _METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")  # metrics that LeRobot's `update_policy` sets
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
 
 
 class Trainer:
-    """Policy, processors, optimiser and data of one run of behaviour cloning on labelled datasets.
+    """One run of behaviour cloning on labelled datasets: its data, its networks, and the steps that fit them.
 
-    shares: share of the samples from each dataset. weights: how often each frame is drawn, relative to the others,
-    (N,); without either, each frame is drawn once per epoch. on_frames: called with the number of newly decoded
-    pictures. On one CPU the same data, config and threads give the same bits, resumed or not. If started by
+    On one CPU the same data, config and threads give the same bits, resumed or not. If started by
     `accelerate launch` or `torchrun`, every process takes `batch_size` samples per step.
 
-    Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for data that are not
-    finite, and `ManipError` for features that the policy refuses.
+    Args:
+        datasets: The labelled datasets.
+        config: The options of the fit.
+        output_dir: The folder of the run.
+        shares: Share of the samples from each dataset.
+        weights: How often each frame is drawn, relative to the others, (N,). Without weights and
+            shares, each frame is drawn once per epoch.
+        resume: Continue from the folder's last checkpoint.
+        on_start: Called when the inputs have been checked, before anything is written.
+        on_frames: Called with the number of newly decoded pictures.
+
+    Raises:
+        FolderExistsError: The folder has a checkpoint, and `resume` is not set.
+        NotFiniteError: The data are not finite.
+        ManipError: The policy refuses the features of the data.
     """
 
     def __init__(
@@ -76,78 +88,92 @@ class Trainer:
         *,
         shares: Sequence[float] = (),
         resume: bool = False,
+        on_start: Callable[[], None] = lambda: None,
         on_frames: Callable[[int], None] | None = None,
         weights: F64 | None = None,
     ):
-        first, spec = datasets[0], datasets[0].spec
-        roots, specs = [one.root for one in datasets], [one.spec for one in datasets]
+        self.config = config
+        self.output_dir = output_dir
+        self.datasets = datasets
+        roots, specs = [dataset.root for dataset in datasets], [dataset.spec for dataset in datasets]
         check_same_sources(roots, specs, pictures=config.takes_images, language=config.kind not in PLAIN)
-        self.config, self.output_dir = config, output_dir
+        spec = specs[0]
+        self.pipeline: Any  # LeRobot's options
         self.pipeline, space = lerobot_options(config, spec.action_meaning)
-        assert self.pipeline.policy is not None
-        policy = self.pipeline.policy
-        self.accelerator = _accelerator(policy)
+        columns = input_columns(config, datasets[0].root, datasets[0].info)
+        on_start()
+        self.accelerator = _accelerator(self.pipeline.policy)
         self.accelerator.wait_for_everyone()  # the first process may be emptying the folder
-        checkpoint = last_checkpoint(output_dir, resume=resume)
-        begun = Checkpoint.open(checkpoint / PRETRAINED_MODEL) if checkpoint else config.initial
-        conversion = conversion_for(space, spec, begun)
-        self._conversion = conversion if is_in_processors(policy.type, conversion) else None
-        if policy.type in OWN_SPACE:
-            vars(policy).update(action_space=conversion.space, grippers=conversion.grippers)
+        last = last_checkpoint(output_dir, resume=resume)
+        resumed = None if last is None else Checkpoint.open(last / PRETRAINED_MODEL)
+        self.conversion = conversion_for(space, spec, resumed or config.initial)
+        in_processors = is_in_processors(self.pipeline.policy.type, self.conversion)
+        self.encoder = self.conversion if in_processors else None  # else the network converts
         self.meta: Any = JoinedDatasets(datasets)
-        set_features(policy, self.meta.features, input_columns(config, first.root, first.info), config.observes)
-        self.data = load_data(
+        self.data = self.read_data(columns, on_frames)
+        self.order = self.draw_order(shares, weights)
+        self._augment = Augment() if config.augments else None
+        self.origin = self.describe(shares)
+        self.step = 0
+        with threads(config.threads):
+            self.build_networks(resumed)
+
+    def read_data(self, columns: Sequence[str], on_frames: Callable[[int], None] | None) -> Samples:
+        """Read the samples of the datasets, of which the policy observes `columns`."""
+        policy, config = self.pipeline.policy, self.config
+        if policy.type in OWN_SPACE:
+            policy.action_space = self.conversion.space
+            policy.grippers = self.conversion.grippers
+        set_features(policy, self.meta.features, columns, config.observes)
+        self.pipeline.dataset = DatasetConfig(self.meta.repo_id, root=str(_portable(self.datasets[-1].root)))
+        return load_data(
             policy,
             self.meta,
             eval_split=config.eval_split,
             seed=config.seed,
-            encode=self._conversion.encode if self._conversion else None,
+            encode=self.encoder.encode if self.encoder else None,
             on_frames=on_frames,
         )
-        self.meta.table = self.data.table
-        drawn = row_weights(datasets, shares, self.data.train) if shares else None
-        drawn = drawn if weights is None else weights[self.data.train]
-        shift = 0 if getattr(policy, "heatmap_weight", 0) else Augment.shift  # heat maps do not move with a crop
-        self._augment = Augment(shift) if config.augments else None
-        self.origin = self._origin(datasets, shares, space)
-        self.pipeline.dataset = DatasetConfig(self.meta.repo_id, root=str(_portable(datasets[-1].root)))
-        self.pipeline.output_dir = output_dir
-        self.steps = self.pipeline.steps
-        self.batch_size = self.pipeline.batch_size
-        self.step = 0
-        with threads(config.threads):
-            self._build(policy, checkpoint)
-        world = self.accelerator.num_processes
-        self._order = Order(len(self.data.train), drawn, self.batch_size * world, config.seed)
 
-    def _origin(self, datasets: Sequence[Dataset], shares: Sequence[float], space: str) -> Origin:
-        first, augment = datasets[0], self._augment
+    def draw_order(self, shares: Sequence[float], weights: F64 | None) -> Order:
+        """Return the order in which all processes together draw the training samples."""
+        rows = self.data.train
+        drawn = row_weights(self.datasets, shares, rows) if shares else None
+        drawn = drawn if weights is None else weights[rows]
+        batch_size = self.pipeline.batch_size * self.accelerator.num_processes
+        return Order(len(rows), drawn, batch_size, self.config.seed)
+
+    def describe(self, shares: Sequence[float]) -> Origin:
+        """Return what a checkpoint stores about its training."""
+        first = self.datasets[0]
         return Origin.of(
             first.spec,
             first.fingerprint,
-            {"eval_split": self.config.eval_split, "augment": asdict(augment) if augment else None},
+            {"eval_split": self.config.eval_split, "augment": asdict(self._augment) if self._augment else None},
             self.config.observes,
             recorded_look(first.provenance, first.fingerprint),
             datasets=[
-                {"name": one.root.resolve().name, "frames": len(one), "weight": share}
-                for one, share in zip(datasets, shares or [None] * len(datasets), strict=True)
+                {"name": dataset.root.resolve().name, "frames": len(dataset), "weight": share}
+                for dataset, share in zip(self.datasets, shares or repeat(None), strict=False)
             ],
-            action_space=space,
+            action_space=self.conversion.space,
         )
 
-    def _build(self, config: PreTrainedConfig, checkpoint: Path | None) -> None:
+    def build_networks(self, resumed: Checkpoint | None) -> None:
+        """Build policy, processors, optimiser and schedule, or load them from the checkpoint to resume."""
         set_seed(self.config.seed % 2**32)  # NumPy takes no larger seeds
-        before = checkpoint / PRETRAINED_MODEL if checkpoint is not None else None
-        policy = build_policy(config, self.meta, before)
+        config = self.pipeline.policy
+        policy = build_policy(config, self.meta, resumed)
         optimizer, scheduler = make_optimizer_and_scheduler(self.pipeline, policy)
-        if before is None or checkpoint is None:
-            self.preprocessor, self.postprocessor = build_processors(config, self.meta, self._conversion)
+        if resumed is None:
+            processors = build_processors(config, self.meta, self.encoder)
         else:
-            with in_one_line(f"{checkpoint} cannot be resumed; start again with --overwrite=true"):
-                opened, learns = Checkpoint.open(before), self._conversion is not None
-                processors = load_processors(opened, config, trust=self.config.trust, learns=learns)
-                self.preprocessor, self.postprocessor = processors
-                self.step, optimizer, scheduler = load_training_state(checkpoint, optimizer, scheduler)
+            last = resumed.path.parent
+            with in_one_line(f"{last} cannot be resumed; start again with --overwrite=true"):
+                learns = self.encoder is not None
+                processors = load_processors(resumed, config, trust=self.config.trust, learns=learns)
+                self.step, optimizer, scheduler = load_training_state(last, optimizer, scheduler)
+        self.preprocessor, self.postprocessor = processors
         self.policy, self.optimizer, self.scheduler = self.accelerator.prepare(policy, optimizer, scheduler)
         self.unwrapped = self.accelerator.unwrap_model(self.policy)  # without the wrapper of distributed training
 
@@ -157,13 +183,15 @@ class Trainer:
         on_step: called after every step, with the metrics if there are any, else with {}; an exception from it ends
         the fit (after `KeyboardInterrupt` a checkpoint is saved). Raises `NotFiniteError` if the loss is not finite.
         """
-        main = self.accelerator.is_main_process
-        metrics = metric_writers(self.output_dir, self.step, self.config.tensorboard, self.pipeline)
-        with threads(self.config.threads), metrics if main else contextlib.nullcontext(list[Writer]()) as writers:
+        self.pipeline.output_dir = self.output_dir
+        metrics = contextlib.nullcontext(list[Writer]())
+        if self.accelerator.is_main_process:
+            metrics = metric_writers(self.output_dir, self.step, self.config.tensorboard, self.pipeline)
+        with threads(self.config.threads), metrics as writers:
             for record in self.run():
                 for write in writers if record else []:
                     write(record)
-                saved = self.step % self.pipeline.save_freq == 0 or self.step == self.steps
+                saved = self.step % self.pipeline.save_freq == 0 or self.step == self.pipeline.steps
                 if saved:
                     self.save()
                 try:
@@ -178,40 +206,41 @@ class Trainer:
 
     def run(self) -> Iterator[dict[str, Any]]:
         """Take the remaining steps; yield metrics after every `log_freq`-th and the last step, {} after the others."""
-        preset = self.pipeline.optimizer
-        since = self.step
-        started = time.perf_counter()
-        assert preset is not None
         metrics = MetricsTracker(1, 1, 1, {name: AverageMeter(name) for name in _METRICS})
-        while self.step < self.steps:
-            batch = self.preprocessor(self._augmented(self.batch(self.step)))
-            update_policy(
-                metrics,
-                self.policy,
-                batch,
-                self.optimizer,
-                preset.grad_clip_norm,
-                self.accelerator,
-                self.scheduler,
-            )
-            loss, lr = metrics.metrics["loss"].val, metrics.metrics["lr"].val
-            if not math.isfinite(loss):
-                raise NotFiniteError(f"the loss is {loss} at step {self.step}; lower the learning rate ({lr:g})")
-            self.step += 1
-            if self.step % self.config.log_freq and self.step != self.steps:
+        since, started = self.step, time.perf_counter()
+        while self.step < self.pipeline.steps:
+            self.take_step(metrics)
+            if self.step % self.config.log_freq and self.step != self.pipeline.steps:
                 yield {}
                 continue
-            samples = (self.step - since) * self.batch_size * self.accelerator.num_processes
+            samples = (self.step - since) * self.order.batch_size
             rate = round(samples / max(time.perf_counter() - started, 1e-9), 1)
             means = {name: meter.avg for name, meter in metrics.metrics.items()}
+            lr = metrics.metrics["lr"].val
             yield {"step": self.step, **means, "lr": lr, "samples_per_s": rate} | self.validate()
             metrics.reset_averages()
             since, started = self.step, time.perf_counter()
 
+    def take_step(self, metrics: MetricsTracker) -> None:
+        """Take one gradient step, which `metrics` counts. Raises `NotFiniteError` if the loss is not finite."""
+        update_policy(
+            metrics,
+            self.policy,
+            self.preprocessor(self._augmented(self.batch(self.step))),
+            self.optimizer,
+            self.pipeline.optimizer.grad_clip_norm,
+            self.accelerator,
+            self.scheduler,
+        )
+        loss, lr = metrics.metrics["loss"].val, metrics.metrics["lr"].val
+        if not math.isfinite(loss):
+            raise NotFiniteError(f"the loss is {loss} at step {self.step}; lower the learning rate ({lr:g})")
+        self.step += 1
+
     def batch(self, step: int) -> Batch:
         """Return this process's samples at a step, as stored."""
-        size, place = self.batch_size, self.accelerator.process_index
-        rows = self._order.batch(step)[place * size : (place + 1) * size]
+        size, place = self.pipeline.batch_size, self.accelerator.process_index
+        rows = self.order.batch(step)[place * size : (place + 1) * size]
         return self.data.batch(self.data.train[rows])
 
     def validate(self) -> dict[str, float]:
@@ -219,7 +248,7 @@ class Trainer:
 
         Also returns the other numbers that the policy outputs, such as the parts of its loss.
         """
-        held_out, size = self.data.held_out, self.batch_size
+        held_out, size = self.data.held_out, self.pipeline.batch_size
         policy = self.unwrapped
         policy.eval()
         sums = defaultdict[str, float](float)
@@ -229,9 +258,9 @@ class Trainer:
                 rows: I64 = held_out[start : start + size]
                 batch = pictures_to_float(self.data.batch(rows), self.data.pictures)
                 loss, outputs = policy.forward(self.preprocessor(batch))
-                numbers = {name: value for name, value in (outputs or {}).items() if isinstance(value, int | float)}
-                for name, value in (numbers | {"loss": loss.item()}).items():
-                    sums[f"val_{name}"] += value * len(rows) / len(held_out)
+                for name, value in {**(outputs or {}), "loss": loss.item()}.items():
+                    if isinstance(value, int | float):
+                        sums[f"val_{name}"] += value * len(rows) / len(held_out)
         return dict(sums)
 
     def save(self) -> None:
@@ -239,10 +268,10 @@ class Trainer:
         if self.accelerator.is_main_process:
             pipeline = copy.copy(self.pipeline)
             pipeline.output_dir = _portable(self.output_dir)
-            with new_checkpoint(get_step_checkpoint_dir(self.output_dir, self.steps, self.step)) as new:
+            with new_checkpoint(get_step_checkpoint_dir(self.output_dir, pipeline.steps, self.step)) as new:
                 state, processors = (self.optimizer, self.scheduler), (self.preprocessor, self.postprocessor)
                 save_checkpoint(new, self.step, pipeline, self.unwrapped, *state, *processors)
-                write_own_files(new, self.origin, read_step(new) | {"batch_size": self.batch_size})
+                write_own_files(new, self.origin, read_step(new) | {"batch_size": pipeline.batch_size})
         self.accelerator.wait_for_everyone()
 
     def _augmented(self, batch: Batch) -> Batch:
@@ -262,16 +291,14 @@ def _portable(path: Path) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else Path(path.name)
 
 
-def _on_this_cpu() -> str:
-    """Return the precision to train in: "bf16" if the CPU supports it, else "no" (single precision)."""
-    return "bf16" if torch.ops.mkldnn._is_mkldnn_bf16_supported() else "no"  # pyright: ignore[reportPrivateUsage]
-
-
 def _accelerator(policy: PreTrainedConfig) -> Accelerator:
     """Return an accelerator as in lerobot-train. The policy's `dtype`, if any, or else `use_amp` sets the precision."""
     precision = _HALF_PRECISION.get(getattr(policy, "dtype", None) or "", "no")
     if not hasattr(policy, "dtype") and policy.use_amp:
-        precision = _on_this_cpu() if policy.device == "cpu" else "fp16"
+        precision = "fp16"
+        if policy.device == "cpu":
+            has_bfloat16 = torch.ops.mkldnn._is_mkldnn_bf16_supported()  # pyright: ignore[reportPrivateUsage]
+            precision = "bf16" if has_bfloat16 else "no"
     if not torch.distributed.is_initialized():  # accelerate keeps the precision of the first fit in a process
         AcceleratorState._reset_state(reset_partial_state=True)  # pyright: ignore[reportPrivateUsage]
     ours = policy.type in OWN_SPACE  # every process has equal buffers, except for the cnn's mean error

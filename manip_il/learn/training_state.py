@@ -14,7 +14,6 @@ previous one. `lerobot-train --config_path=.../pretrained_model/train_config.jso
 from __future__ import annotations
 
 import functools
-import importlib
 import json
 import os
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -86,16 +85,25 @@ def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -
 def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPipelineConfig) -> Iterator[list[Writer]]:
     """Yield functions to call with each record, which write it to the metrics file and other requested outputs.
 
-    step: steps already taken. curves: whether to write to TensorBoard. pipeline: has the options for Weights &
-    Biases. Raises `UsageError` if a requested output's package is not installed.
+    Args:
+        output_dir: The folder of the run.
+        step: Steps already taken.
+        curves: Whether to write to TensorBoard.
+        pipeline: LeRobot's options, among them those of Weights & Biases.
+
+    Raises:
+        UsageError: A requested output's package is not installed.
     """
     with ExitStack() as stack:
         writers = [json_lines(output_dir / METRICS_FILE, step)]
-        if curves:
-            writers.append(stack.enter_context(_tensorboard(output_dir / TENSORBOARD_FOLDER, step)))
-        if pipeline.wandb.enable:
-            pipeline.resume = step > 0
-            writers.append(_weights_and_biases(pipeline))
+        try:
+            if curves:
+                writers.append(stack.enter_context(_tensorboard(output_dir / TENSORBOARD_FOLDER, step)))
+            if pipeline.wandb.enable:
+                pipeline.resume = step > 0
+                writers.append(_weights_and_biases(pipeline))
+        except ImportError as error:
+            raise UsageError(f"a requested output of metrics needs {error.name}: pip install {error.name}") from error
         yield writers
 
 
@@ -109,10 +117,8 @@ def json_lines(path: Path, step: int) -> Writer:
 @contextmanager
 def _tensorboard(folder: Path, step: int) -> Iterator[Writer]:
     """Yield a function that adds a record's numbers to TensorBoard's curves."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise UsageError("--tensorboard=true needs TensorBoard: pip install 'manip_il[tensorboard]'") from error
+    from torch.utils.tensorboard import SummaryWriter  # an extra
+
     with SummaryWriter(str(folder), purge_step=step + 1 if step else None) as writer:
 
         def write(record: Record) -> None:
@@ -125,10 +131,7 @@ def _tensorboard(folder: Path, step: int) -> Iterator[Writer]:
 
 def _weights_and_biases(config: TrainPipelineConfig) -> Writer:
     """Return a function that logs a record with LeRobot's own logger."""
-    try:
-        importlib.import_module("wandb")  # LeRobot's logger imports it, with a less helpful error
-        from lerobot.common.wandb_utils import WandBLogger
-    except ImportError as error:
-        raise UsageError("--wandb.enable=true needs Weights & Biases: pip install wandb") from error
+    from lerobot.common.wandb_utils import WandBLogger  # which imports LeRobot
+
     logger = WandBLogger(config)
     return lambda record: logger.log_dict(dict(record), record["step"])

@@ -8,7 +8,7 @@ import torch
 from manip_il.chapter.config import PPOConfig
 from manip_il.chapter.episodes import ActionRange, Lockstep
 from manip_il.chapter.ppo import Learner, seed_generators
-from manip_il.learn.network import MLPNetwork, Shape
+from manip_il.learn.network import MLPNetwork, NetworkConfig
 
 STEPS, EPISODES = 10, 8
 ACTIONS = ActionRange(*(np.array(values, np.float32) for values in ([0, 0], [0.5, 0], [-1, 0], [1, 0])))
@@ -39,7 +39,7 @@ class Point:
 
 
 def network() -> MLPNetwork:
-    made = MLPNetwork(3, 2, Shape(width=32, depth=2, loss="gaussian", action_space="joint_target"))
+    made = MLPNetwork(3, 2, NetworkConfig(width=32, depth=2, loss="gaussian", action_space="joint_target"))
     names = ("mean", "scale", "low", "high")
     made.set_statistics({f"target_{name}": torch.from_numpy(getattr(ACTIONS, name)) for name in names})
     return made

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import draccus
 import numpy as np
 import pytest
 import torch
@@ -14,16 +13,14 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import make_pre_post_processors
 
 from manip_il.errors import MismatchError, UsageError
-from manip_il.learn.checkpoint import CONFIG, Checkpoint
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.lerobot_config import policy_config
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.mlp import MLPPolicy
 from manip_il.learn.network import threads
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import Trainer
 
-from ..damage import edit_json
 from .tiny_policies import observations
 
 
@@ -62,20 +59,6 @@ def test_acting_is_the_same_through_lerobots_processors(checkpoint):
         fast = LearnedPolicy.load(checkpoint).act(states[row : row + 1], environments[row : row + 1])
         assert fast.dtype == np.float64
         assert np.array_equal(action.numpy().astype(np.float64), fast)
-
-
-def test_a_categorical_checkpoint_from_before_targets_were_smeared_acts_as_it_did(dataset, tmp_path):
-    config = FitConfig({"loss": "categorical", "sigma": 0.0}, steps=3, batch_size=32)
-    path = Trainer(dataset, config, tmp_path / "run").fit()
-    states, environments = observations(9)
-    before = LearnedPolicy.load(path).act(states, environments)
-    edit_json(path / CONFIG, lambda settings: settings.pop("sigma"))
-    assert np.array_equal(LearnedPolicy.load(path).act(states, environments), before)
-    policy = MLPPolicy.from_pretrained(path)  # as LeRobot's tools load it
-    actions = policy.model.act(torch.from_numpy(np.concatenate([states, environments], axis=1)))
-    assert np.array_equal(actions.numpy().astype(np.float64), before)
-    assert draccus.encode(policy_config(FitConfig({"path": str(path)})))["sigma"] == 0  # learning goes on as it began
-    assert draccus.encode(policy_config(FitConfig({"loss": "categorical"})))["sigma"] == 3
 
 
 def test_off_the_data_an_arm_target_stays_as_near_as_in_the_data(checkpoint, table):
