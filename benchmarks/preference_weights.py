@@ -31,7 +31,7 @@ from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.main import main as manip_il
 from manip_il.data import schema
 from manip_il.data.build import merge_datasets, rewrite_columns
-from manip_il.data.dataset import Dataset, Own, StoredEpisode
+from manip_il.data.dataset import Dataset, EpisodeData, Own
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import EvalResult
@@ -136,7 +136,7 @@ def join(good: Path, bad: Path, target: Path) -> None:
     merge_datasets(made, target, [f"0:{count}", f"{first}:{first + count}"])
 
 
-def as_recorded(episode: StoredEpisode) -> dict[str, np.ndarray]:
+def as_recorded(episode: EpisodeData) -> dict[str, np.ndarray]:
     """Return the executed actions as labels."""
     action = episode.columns[schema.EXECUTED_ACTION]
     return {schema.ACTION: action, schema.LABEL_VALID: np.ones(len(action), np.int64)}

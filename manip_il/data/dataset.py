@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.camera import Camera
+from manip_il.data.camera import Camera, FrameRange
 from manip_il.data.info import NUMBERS, PICTURES, Feature, Info, read_info, reading
 from manip_il.data.parquet_files import (
     Column,
@@ -48,21 +49,30 @@ class Own:
 
 
 @dataclass(frozen=True)
-class StoredEpisode:
-    """An episode as it is stored.
+class EpisodeData:
+    """An episode that is written to a dataset, or as it is stored in one.
 
-    tasks: the text of every frame. others: values in the columns of `meta/episodes` that LeRobot does not have.
-    columns: those of the data files, (T,) or (T, ...); all but numbers as Arrow arrays. clips: by camera, as from
-    `Dataset.clip`.
+    Its films and statistics of pictures are copied for the cameras that are not among its columns.
+
+    Args:
+        columns: (T,) or (T, ...), pictures (T, height, width, 3); stored text and PNG files are Arrow arrays.
+        tasks: The text of every frame.
+        others: Values in the columns of `meta/episodes` that LeRobot does not have.
+        dataset: Where it is stored.
+        number: Its number there.
+        films: Its frames in the films of each camera there.
+        picture_statistics: Stored statistics of its pictures, by camera.
+        cut: Whether only its part of a film is copied, not the whole file.
     """
 
-    dataset: Dataset
-    number: int
-    tasks: list[str]
-    others: dict[str, Any]
-    columns: dict[str, Column]
-    clips: dict[str, tuple[Path, int, int]]
-    picture_statistics: Statistics
+    columns: Mapping[str, Column]
+    tasks: Sequence[str]
+    others: Mapping[str, Any] = field(default_factory=dict)
+    dataset: Dataset | None = None
+    number: int = 0
+    films: Mapping[str, FrameRange] = field(default_factory=dict)
+    picture_statistics: Statistics = field(default_factory=dict)
+    cut: bool = False
 
 
 class Dataset:
@@ -206,23 +216,41 @@ class Dataset:
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
     def camera(self, key: str) -> Camera:
-        """Return a camera's pictures, not yet decoded. Raises what `Camera.of` raises."""
-        return Camera.of(self.root, self.info, self.episodes, self.data_files, key)
+        """Find a camera's pictures without decoding them.
+
+        Raises `UnknownName` for a column that is not a camera, and `ManipError` for depth maps or if the dataset's
+        files do not hold each frame exactly once.
+        """
+        if key not in self.cameras:
+            raise UnknownName(f"camera in {self.root}", key, self.cameras)
+        feature = self.features[key]
+        if not feature.is_rgb:
+            raise ManipError(f"{key} of {self.root} has shape {feature.shape}; expected RGB pictures")
+        films = feature.dtype == "video"
+        found = self._film_ranges(key) if films else self._cell_ranges()
+        parts = sorted((part for part in found if part.count), key=lambda part: part.row)
+        ends = np.cumsum([0, *(part.count for part in parts)]).tolist()
+        if [*(part.row for part in parts), len(self)] != ends:
+            raise ManipError(f"{self.root}: the files of {key} do not hold each of the {len(self)} frames exactly once")
+        return Camera(key, self.fps, feature.picture_size, films, tuple(parts))
+
+    def _film_ranges(self, key: str) -> list[FrameRange]:
+        """Return where a camera's films hold each episode."""
+        table, clips = self.episodes, self.episodes.clips[key]
+        firsts = np.round(clips.starts * self.fps).astype(np.int64).tolist()
+        paths = (self.root / file for file in clips.files)
+        rows = zip(paths, firsts, table.length.tolist(), table.start.tolist(), strict=True)
+        return [FrameRange(*row) for row in rows]
+
+    def _cell_ranges(self) -> list[FrameRange]:
+        """Return the rows of each data file."""
+        counts = [count_rows(path) for path in self.data_files]
+        starts = np.cumsum([0, *counts]).tolist()
+        return [FrameRange(*row) for row in zip(self.data_files, repeat(0), counts, starts, strict=False)]
 
     def frames(self, key: str, rows: I64) -> NDArray[np.uint8]:
         """Return a camera's decoded pictures, (B, height, width, 3), of these rows, (B,)."""
         return self.camera(key).rows(rows)
-
-    def clip(self, key: str, episode: int) -> tuple[Path, int, int]:
-        """Return where a camera's pictures of an episode are: video file, first frame in it, number of frames."""
-        clips, [place] = self.episodes.clips[key], np.flatnonzero(self.episodes.index == episode)
-        first = round(float(clips.starts[place]) * self.fps)
-        return self.root / clips.files[place], first, int(self.episodes.length[place])
-
-    @cached_property
-    def picture_statistics(self) -> list[Statistics]:
-        """Statistics of every episode's pictures, by camera."""
-        return read_picture_statistics(self.root, self.cameras)
 
     def rows_of(self, episode: int) -> I64:
         """Return the rows of an episode, (T,). Raises `UsageError` if it does not exist."""
@@ -232,11 +260,10 @@ class Dataset:
         [place] = np.flatnonzero(table.index == episode)[:1]
         return np.arange(table.start[place], table.start[place] + table.length[place])
 
-    @cached_property
+    @property
     def stored_features(self) -> layout.Features:
         """The features in `info.json`, with everything that it says of them, without LeRobot's index columns."""
-        table = checks.read_json(self.root / layout.INFO, "a dataset's description")["features"]
-        return {key: one for key, one in table.items() if key not in layout.INDEX_DTYPES}
+        return {key: one.table for key, one in self.features.items() if key not in layout.INDEX_DTYPES}
 
     @property
     def other_tables(self) -> list[Path]:
@@ -251,7 +278,7 @@ class Dataset:
 
     def stored_episodes(
         self, names: Sequence[str] | None = None, renamed: Mapping[str, str] | None = None
-    ) -> Iterator[StoredEpisode]:
+    ) -> Iterator[EpisodeData]:
         """Yield the episodes as they are stored, in order; one data file is in memory at a time.
 
         names: columns to read, by default all in data files, except the numbers of rows, episodes and tasks. renamed:
@@ -261,6 +288,8 @@ class Dataset:
             names = [key for key, one in self.features.items() if one.dtype != "video" and key not in _NUMBERED]
         new = {key: (renamed or {}).get(key, key) for key in self.features}
         undrawn = {layout.DRAWN: "{}"} if s.SIM_STATE in self.features else {}
+        films = {key: self._film_ranges(key) for key in self.episodes.clips}
+        statistics = read_picture_statistics(self.root, self.cameras)
         for path in self.data_files:
             with reading(path):
                 rows = read_file(path, [*names, layout.EPISODE_INDEX, layout.TASK_INDEX])
@@ -272,14 +301,14 @@ class Dataset:
                 for number in np.unique(index).tolist():
                     start, stop = np.searchsorted(index, [number, number + 1])
                     [place] = np.flatnonzero(self.episodes.index == number)
-                    yield StoredEpisode(
+                    yield EpisodeData(
                         dataset=self,
                         number=number,
                         tasks=texts[start:stop],
                         others=undrawn | self.episodes.others[place],
                         columns={name: column[start:stop] for name, column in columns.items()},
-                        clips={new[key]: self.clip(key, number) for key in self.episodes.clips},
-                        picture_statistics={new[key]: one for key, one in self.picture_statistics[place].items()},
+                        films={new[key]: ranges[place] for key, ranges in films.items()},
+                        picture_statistics={new[key]: one for key, one in statistics[place].items()},
                     )
 
     def count_successes(self) -> int:

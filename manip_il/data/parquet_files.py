@@ -7,7 +7,7 @@ keeps the column, its split and delete drop it; the draws are also part of `sim_
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
@@ -203,26 +203,20 @@ class EpisodeTable:
 
 def read_episode_table(root: Path, info: Info) -> EpisodeTable:
     """Read `meta/episodes`, without statistics. Raises `ManipError` naming a file that cannot be read."""
-    paths = sorted(root.glob(layout.EPISODES_FILES))
-    if not paths:
-        raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
     with reading(root / "meta/episodes"):
-        tables = [
-            read_file(path, [name for name in column_names(path) if not name.startswith("stats/")]) for path in paths
-        ]
-        table = pa.concat_tables(tables, promote_options="permissive")
+        table = _read_rows(root, lambda name: not name.startswith("stats/"))
 
         def numbers(name: str) -> I64:
             return table.column(name).cast(pa.int64()).to_numpy()
 
         def clips(key: str) -> VideoSpans:
-            places = zip(
-                *(numbers(f"videos/{key}/{name}").tolist() for name in ("chunk_index", "file_index")), strict=True
-            )
-            files = [
-                layout.VIDEO_PATH.format(chunk_index=chunk, file_index=file, video_key=key) for chunk, file in places
+            chunks = numbers(f"videos/{key}/chunk_index").tolist()
+            files = numbers(f"videos/{key}/file_index").tolist()
+            paths = [
+                layout.VIDEO_PATH.format(chunk_index=chunk, file_index=file, video_key=key)
+                for chunk, file in zip(chunks, files, strict=True)
             ]
-            return VideoSpans(files, table.column(f"videos/{key}/from_timestamp").to_numpy())
+            return VideoSpans(paths, table.column(f"videos/{key}/from_timestamp").to_numpy())
 
         tasks = table.column("tasks").to_pylist() if "tasks" in table.column_names else [None] * len(table)
         return EpisodeTable(
@@ -239,13 +233,20 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
 def read_picture_statistics(root: Path, cameras: Sequence[str]) -> list[Statistics]:
     """Return the stored statistics of every episode's pictures, by camera column."""
     found: list[Statistics] = []
-    for path in sorted(root.glob(layout.EPISODES_FILES)):
-        names = {f"stats/{key}/{name}": (key, name) for key in cameras for name in layout.STAT_NAMES}
-        here = [name for name in column_names(path) if name in names]
-        for row in read_file(path, [layout.EPISODE_INDEX, *here]).to_pylist():
-            own: Statistics = {}
-            for column in here:
-                key, name = names[column]
+    columns = {f"stats/{key}/{name}": (key, name) for key in cameras for name in layout.STAT_NAMES}
+    for row in _read_rows(root, lambda name: name in columns or name == layout.EPISODE_INDEX).to_pylist():
+        own: Statistics = {}
+        for column, (key, name) in columns.items():
+            if row.get(column) is not None:
                 own.setdefault(key, {})[name] = np.array(row[column])
-            found.append(own)
+        found.append(own)
     return found
+
+
+def _read_rows(root: Path, wanted: Callable[[str], bool]) -> pa.Table:
+    """Return columns of `meta/episodes`, chosen by name."""
+    paths = sorted(root.glob(layout.EPISODES_FILES))
+    if not paths:
+        raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
+    tables = [read_file(path, [*filter(wanted, column_names(path))]) for path in paths]
+    return pa.concat_tables(tables, promote_options="permissive")

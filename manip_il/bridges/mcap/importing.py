@@ -6,7 +6,7 @@ An episode lasts from the time when all topics have started to the time when the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,11 @@ from manip_il import checks
 from manip_il.bridges.mcap.mapping import TASK, TEXT, Mapping, TopicSource
 from manip_il.bridges.mcap.path import values_at
 from manip_il.bridges.mcap.read import read_messages, read_pictures, read_topics
+from manip_il.data.dataset import EpisodeData
 from manip_il.data.foxglove import NANOSECONDS, frame_times
-from manip_il.data.lerobot_write import new_dataset
-from manip_il.data.schema import exact_rate, plain_rate
+from manip_il.data.info import Info
+from manip_il.data.lerobot_write import write_episodes
+from manip_il.data.schema import exact_rate
 from manip_il.errors import ManipError, MismatchError, nearest
 from manip_il.mdp import I64
 
@@ -34,21 +36,36 @@ def list_files(source: Path) -> list[Path]:
     return paths or [source]
 
 
-def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[int]:
-    """Write the files as a dataset, which appears at `root` when it is complete; yield each episode's frame count.
+def import_files(
+    paths: list[Path], root: Path, mapping: Mapping, on_episode: Callable[[], object] = lambda: None
+) -> Info:
+    """Write the files as a dataset, which appears at `root` when it is complete.
 
-    All files are first read in a child process with limited memory and time. Raises `FolderExistsError` if `root` is
-    not empty, `MismatchError` if shapes differ between files, and what `checks.in_child` and `read_frames` raise.
+    All files are first read in a child process with limited memory and time.
+
+    Args:
+        paths: One file for each episode.
+        root: The new folder.
+        mapping: Which messages become columns.
+        on_episode: Called before each episode is written.
+
+    Raises:
+        FolderExistsError: `root` is not empty.
+        MismatchError: Shapes differ between files.
+        ManipError: As raised by `checks.in_child` and `read_frames`.
     """
     checks.in_child(str(paths[0]), _read_all, paths, mapping)
     features = _features(next(read_frames(paths[0], mapping)), mapping)
-    with new_dataset(root, features, plain_rate(mapping.fps), mapping.robot_type) as writer:
+
+    def episodes() -> Iterator[EpisodeData]:
         for path in paths:
             frames = list(read_frames(path, mapping))
             columns = {key: np.stack([frame[key] for frame in frames]) for key in features}
             texts = {key: columns[key].astype(object) for key in features if features[key]["dtype"] == TEXT}
-            writer.add_columns(columns | texts, [frame[TASK] for frame in frames], {})
-            yield len(frames)
+            on_episode()
+            yield EpisodeData(columns | texts, [frame[TASK] for frame in frames])
+
+    return write_episodes(episodes(), root, features, mapping.fps, mapping.robot_type or "")
 
 
 def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
