@@ -83,10 +83,13 @@ def exclusive(folder: Path) -> Generator[int]:
         folder.mkdir(parents=True, exist_ok=True)
     handle = os.open(folder, os.O_RDONLY)
     try:
-        if not _try_lock(handle):
-            raise ManipError(
-                f"{folder} is in use by another process; wait until that is done, or choose another folder"
-            )
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            text = f"{folder} is in use by another process; wait until that is done, or choose another folder"
+            raise ManipError(text) from error
+        except OSError:  # a cluster's file system may not support locks
+            pass
         try:
             yield handle
         finally:
@@ -137,16 +140,6 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _try_lock(handle: int) -> bool:
-    """Lock an open file or folder until it is closed; return False if another process holds it."""
-    with contextlib.suppress(OSError):  # a cluster's file system may not support locks
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-    return True
 
 
 def _libc(name: str, *arguments: int | bytes) -> None:

@@ -9,7 +9,6 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -186,16 +185,22 @@ class Dataset:
             return read_statistics(self.root)
         return column_statistics(self.columns())
 
-    @cached_property
+    @property
     def data_files(self) -> list[Path]:
         """The data files in row order."""
-        paths = sorted(self.root.glob(layout.DATA_FILES))
-        if not paths:
-            raise ManipError(f"{self.root} has no data: no file matches {layout.DATA_FILES}")
-        rows = sum(map(count_rows, paths))
-        if rows != len(self):
+        return [part.path for part in self._cells]
+
+    @cached_property
+    def _cells(self) -> list[FrameRange]:
+        """The rows of each data file."""
+        found: list[FrameRange] = []
+        rows = 0
+        for path in sorted(self.root.glob(layout.DATA_FILES)):
+            found.append(FrameRange(path, 0, count_rows(path), rows))
+            rows += found[-1].count
+        if rows != len(self) or not found:
             raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {rows}")
-        return paths
+        return found
 
     def columns(self, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
         """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors; they may be read-only.
@@ -204,16 +209,18 @@ class Dataset:
         """
         if names is None:
             names = [feature.key for feature in self.info.of_dtype(*NUMBERS)]
-        pieces: list[dict[str, NDArray[Any]]] = []
         known = [key for key, feature in self.features.items() if feature.dtype not in PICTURES]
         for name in names:
             if name not in known:
                 raise UnknownName(f"column in {self.root}", name, known)
-        for path in self.data_files:
-            with reading(path):
-                table = read_file(path, names)
-                pieces.append({name: to_numpy(table.column(name), self.features[name]) for name in names})
+        pieces = [self._read(path, names) for path in self.data_files]
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
+
+    def _read(self, path: Path, names: Sequence[str]) -> dict[str, Column]:
+        """Read columns of a data file: numbers as numpy arrays, others as Arrow arrays."""
+        with reading(path):
+            table = read_file(path, names)
+            return {name: to_numpy(table.column(name), self.features[name]) for name in names}
 
     def camera(self, key: str) -> Camera:
         """Find a camera's pictures without decoding them.
@@ -227,7 +234,7 @@ class Dataset:
         if not feature.is_rgb:
             raise ManipError(f"{key} of {self.root} has shape {feature.shape}; expected RGB pictures")
         films = feature.dtype == "video"
-        found = self._film_ranges(key) if films else self._cell_ranges()
+        found = self._film_ranges(key) if films else self._cells
         parts = sorted((part for part in found if part.count), key=lambda part: part.row)
         ends = np.cumsum([0, *(part.count for part in parts)]).tolist()
         if [*(part.row for part in parts), len(self)] != ends:
@@ -241,12 +248,6 @@ class Dataset:
         paths = (self.root / file for file in clips.files)
         rows = zip(paths, firsts, table.length.tolist(), table.start.tolist(), strict=True)
         return [FrameRange(*row) for row in rows]
-
-    def _cell_ranges(self) -> list[FrameRange]:
-        """Return the rows of each data file."""
-        counts = [count_rows(path) for path in self.data_files]
-        starts = np.cumsum([0, *counts]).tolist()
-        return [FrameRange(*row) for row in zip(self.data_files, repeat(0), counts, starts, strict=False)]
 
     def frames(self, key: str, rows: I64) -> NDArray[np.uint8]:
         """Return a camera's decoded pictures, (B, height, width, 3), of these rows, (B,)."""
@@ -287,29 +288,24 @@ class Dataset:
         if names is None:
             names = [key for key, one in self.features.items() if one.dtype != "video" and key not in _NUMBERED]
         new = {key: (renamed or {}).get(key, key) for key in self.features}
-        undrawn = {layout.DRAWN: "{}"} if s.SIM_STATE in self.features else {}
-        films = {key: self._film_ranges(key) for key in self.episodes.clips}
+        table = self.episodes
+        films = {key: self._film_ranges(key) for key in table.clips}
         statistics = read_picture_statistics(self.root, self.cameras)
-        for path in self.data_files:
-            with reading(path):
-                rows = read_file(path, [*names, layout.EPISODE_INDEX, layout.TASK_INDEX])
-                index, columns = rows.column(layout.EPISODE_INDEX).to_numpy(), dict[str, Column]()
-                for name in names:
-                    column, feature = rows.column(name), self.features[name]
-                    columns[new[name]] = to_numpy(column, feature) if feature.dtype in NUMBERS else column
-                texts = self.texts(rows.column(layout.TASK_INDEX).to_numpy())
-                for number in np.unique(index).tolist():
-                    start, stop = np.searchsorted(index, [number, number + 1])
-                    [place] = np.flatnonzero(self.episodes.index == number)
-                    yield EpisodeData(
-                        dataset=self,
-                        number=number,
-                        tasks=texts[start:stop],
-                        others=undrawn | self.episodes.others[place],
-                        columns={name: column[start:stop] for name, column in columns.items()},
-                        films={new[key]: ranges[place] for key, ranges in films.items()},
-                        picture_statistics={new[key]: one for key, one in statistics[place].items()},
-                    )
+        undrawn = {layout.DRAWN: "{}"} if s.SIM_STATE in self.features else {}
+        for cells in self._cells:
+            columns = self._read(cells.path, [*names, layout.TASK_INDEX])
+            texts = self.texts(columns.pop(layout.TASK_INDEX))
+            for place in np.flatnonzero((table.start >= cells.row) & (table.start < cells.row + cells.count)):
+                rows = slice(table.start[place] - cells.row, table.stop[place] - cells.row)
+                yield EpisodeData(
+                    columns={new[name]: column[rows] for name, column in columns.items()},
+                    tasks=texts[rows],
+                    others=undrawn | table.others[place],
+                    dataset=self,
+                    number=int(table.index[place]),
+                    films={new[key]: ranges[place] for key, ranges in films.items()},
+                    picture_statistics={new[key]: one for key, one in statistics[place].items()},
+                )
 
     def count_successes(self) -> int:
         """Return how many episodes succeeded at some step; 0 if there is no success column."""
@@ -328,10 +324,11 @@ def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDA
     pieces: list[dict[str, NDArray[Any]]] = []
     episodes = frames = 0
     for dataset in map(Dataset.open, roots):
-        before = {layout.EPISODE_INDEX: episodes, layout.INDEX: frames}
         columns = dataset.columns(names)
-        columns |= {name: columns[name] + first for name, first in before.items() if name in columns}
+        for name, before in ((layout.EPISODE_INDEX, episodes), (layout.INDEX, frames)):
+            if name in columns:
+                columns[name] = columns[name] + before
         pieces.append(columns)
-        episodes, frames = episodes + dataset.info.episodes, frames + len(dataset)
-    shapes = {name: values.shape[1:] for name, values in pieces[0].items()}
-    return {name: np.concatenate([one[name].reshape(-1, *shape) for one in pieces]) for name, shape in shapes.items()}
+        episodes += dataset.info.episodes
+        frames += len(dataset)
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}

@@ -108,37 +108,33 @@ def episode_channels(episode: Episode, times: Times, joints: Sequence[str]) -> d
 
 def add_channels(writer: Writer, channels: Mapping[str, Messages], times: Times) -> None:
     """Write all messages, frame by frame. channels: topic -> messages."""
-    kinds: dict[type, int] = {}  # class of messages -> its schema
+    schemas: dict[type, int] = {}  # class of messages -> its schema
     ids: dict[str, int] = {}
     for frame, (time, messages) in enumerate(zip(times, zip(*channels.values(), strict=True), strict=bool(channels))):
         for topic, message in zip(channels, messages, strict=True):
-            is_text, kind = isinstance(message, str), type(message)
+            kind = type(message)
+            if kind not in schemas:
+                scalars = SCALARS["title"], "jsonschema", json.dumps(SCALARS).encode()
+                schemas[kind] = writer.register_schema(*scalars) if kind is str else register_schema(writer, kind)
             if topic not in ids:
-                if kind not in kinds:
-                    kinds[kind] = _register_scalars(writer) if is_text else register_schema(writer, kind)
-                ids[topic] = writer.register_channel(topic, "json" if is_text else "protobuf", kinds[kind])
+                ids[topic] = writer.register_channel(topic, "json" if kind is str else "protobuf", schemas[kind])
             data = message.encode() if isinstance(message, str) else message.SerializeToString(deterministic=True)
             writer.add_message(ids[topic], time, data, time, frame)
 
 
-def _register_scalars(writer: Writer) -> int:
-    return writer.register_schema(SCALARS["title"], "jsonschema", json.dumps(SCALARS).encode())
+def read_images(chunks: Iterable[Chunk]) -> dict[str, U8]:
+    """Return the pictures that `images` wrote, (T, height, width, 3), by camera.
 
-
-def read_images(chunks: Iterable[Chunk], shape: tuple[int, ...]) -> dict[str, U8]:
-    """Return the pictures that `images` wrote, by camera; a camera without pictures is left out.
-
-    chunks: all chunks of one file, in order. shape: shape of each camera's pictures, (T, height, width, 3).
+    chunks: all chunks of one file, in order.
     """
-    pictures: dict[str, U8] = {}
-    cameras: dict[int, str] = {}  # by the id of their channel
+    pictures: dict[str, list[U8]] = {}
+    topics: dict[int, str] = {}  # by the id of their channel
     for record in (record for chunk in chunks for record in breakup_chunk(chunk)):
-        if isinstance(record, ChannelRecord) and record.topic.startswith(IMAGE_TOPICS):
-            cameras[record.id] = record.topic.removeprefix(IMAGE_TOPICS)
-        elif isinstance(record, MessageRecord) and record.channel_id in cameras:
-            camera = cameras[record.channel_id]
-            if camera not in pictures:
-                pictures[camera] = np.empty(shape, np.uint8)
-            data = RawImage.FromString(record.data).data
-            pictures[camera][record.sequence] = np.frombuffer(data, np.uint8).reshape(shape[1:])
-    return pictures
+        if isinstance(record, ChannelRecord):
+            topics[record.id] = record.topic
+        elif isinstance(record, MessageRecord) and topics[record.channel_id].startswith(IMAGE_TOPICS):
+            image = RawImage.FromString(record.data)
+            camera = topics[record.channel_id].removeprefix(IMAGE_TOPICS)
+            taken = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
+            pictures.setdefault(camera, []).append(taken)
+    return {camera: np.stack(taken) for camera, taken in pictures.items()}

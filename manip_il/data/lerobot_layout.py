@@ -37,6 +37,13 @@ DRAWN = "drawn"  # our column in meta/episodes: an episode's random draws, as JS
 INDEX_DTYPES = {TIMESTAMP: "float32"} | dict.fromkeys((FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX), "int64")
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})  # a file's content and its original name
+_TASK_IS_INDEX = (  # in pandas' words
+    '{"index_columns": ["task"], "column_indexes": [], "columns": ['
+    '{"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", '
+    '"metadata": null}, '
+    '{"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": null}], '
+    '"pandas_version": "2.3.3"}'
+)
 STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
@@ -75,14 +82,9 @@ def data_schema(features: Features, columns: Mapping[str, Any]) -> pa.Schema:
 
 def tasks_table(instructions: Sequence[str]) -> pa.Table:
     """Return the table of tasks, with `task` as pandas' index, because LeRobot looks tasks up by this index."""
-    columns = [
-        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
-        for name, kind, numpy_type in ((TASK_INDEX, "int64", "int64"), ("task", "unicode", "object"))
-    ]
-    pandas = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.3.3"}
     numbers = pa.array(range(len(instructions)), pa.int64())
     table = pa.table({TASK_INDEX: numbers, "task": pa.array(instructions, pa.string())})
-    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+    return table.replace_schema_metadata({"pandas": _TASK_IS_INDEX})
 
 
 def numbered(template: str, number: int, **names: str) -> tuple[str, int, int]:

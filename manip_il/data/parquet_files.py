@@ -150,24 +150,25 @@ def read_tasks(root: Path) -> dict[int, str]:
     """Return the task texts by `task_index`. The file has them in pandas' index column, which may have no name."""
     path = root / layout.TASKS
     with reading(path):
-        table = read_file(path, column_names(path))
-        texts = [one.name for one in table.schema if one.type in (pa.string(), pa.large_string())]
-        name = "task" if "task" in texts else texts[-1]  # pandas writes the index after the columns
+        names = column_names(path)
+        table = read_file(path, names)
+        name = "task" if "task" in names else names[-1]  # pandas writes the index after the columns
         return dict(zip(table.column(layout.TASK_INDEX).to_pylist(), table.column(name).to_pylist(), strict=True))
 
 
-def to_numpy(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
-    """Return a column, (T,) or (T, *shape), with its feature's dtype; text as objects.
+def to_numpy(column: pa.ChunkedArray, feature: Feature) -> Column:
+    """Return a column of numbers, (T,) or (T, *shape), with its feature's dtype; others as they are.
 
     Raises `ValueError` if values have another kind or shape, or are missing.
     """
+    if feature.dtype not in NUMBERS:
+        return column
     array: Any = column.combine_chunks()
     is_vector = feature.size > 1
     while isinstance(array, pa.ExtensionArray | pa.ListArray | pa.FixedSizeListArray):
         array, is_vector = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten(), True
-    dtype = np.dtype(feature.dtype if feature.dtype in NUMBERS else object)
     try:  # files may hold narrower numbers
-        values = array.to_numpy(zero_copy_only=False).astype(dtype, casting="same_kind", copy=False)
+        values = array.to_numpy(zero_copy_only=False).astype(feature.dtype, casting="same_kind", copy=False)
         return values.reshape(len(column), *feature.shape if is_vector else ())
     except (TypeError, ValueError) as error:
         what = f"{feature.dtype} of shape {list(feature.shape)}"

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import av
-import av.logging
 import numpy as np
 from numpy.typing import NDArray
 
@@ -197,18 +196,13 @@ def _video_frame(picture: NDArray[np.uint8], number: int, rate: Fraction) -> av.
 
 
 def try_encoder(config: VideoConfig, size: tuple[int, int], fps: float) -> None:
-    """Encode one picture of this height and width; raises `UsageError` with the encoder's reason if it fails."""
+    """Encode one picture of this height and width; raises `UsageError` if that fails."""
     rate = exact_rate(fps)
-    level = av.logging.get_level()
-    av.logging.set_level(av.logging.ERROR)  # otherwise the reason is not logged
-    with av.logging.Capture() as log:
-        try:
-            encoder = av.CodecContext.create(config.vcodec, "w")
-            _set_up(encoder, config, size, rate)
-            _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, rate))
-            _encode(encoder, None)
-        except (av.FFmpegError, ValueError) as error:
-            reason = log[0][2].strip() if log else str(error)
-            raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {config}: {reason}") from error
-        finally:
-            av.logging.set_level(level)
+    try:
+        encoder = av.CodecContext.create(config.vcodec, "w")
+        _set_up(encoder, config, size, rate)
+        _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, rate))
+        _encode(encoder, None)
+    except (av.FFmpegError, ValueError) as error:
+        expected = f"expected even sizes and settings of {config.vcodec}"
+        raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {config}: {error}; {expected}") from error
