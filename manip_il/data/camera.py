@@ -83,7 +83,7 @@ class Camera:
         which = np.searchsorted(starts, wanted, side="right") - 1
         cuts = np.flatnonzero((np.diff(wanted) != 1) | (np.diff(which) != 0)) + 1
         found = [self._read(self.parts[which[at[0]]], wanted[at]) for at in np.split(np.arange(len(wanted)), cuts)]
-        return np.concatenate(found)[places.reshape(-1)] if len(rows) else np.empty((0, *self.size, 3), np.uint8)
+        return np.concatenate(found)[places.reshape(-1)]
 
     def _read(self, part: FrameRange, rows: I64) -> Pictures:
         """Return the pictures of consecutive rows of one part."""
@@ -194,11 +194,11 @@ def read_frames(container: InputContainer, first: int, count: int, fps: float) -
     stream = container.streams.video[0]
     tick = stream.time_base or 1  # [s]
     container.seek(round(first / fps / tick), stream=stream)  # to the last key frame at or before it
-    pictures: list[NDArray[np.uint8]] = []
+    pictures: list[Any] = []
     for frame in itertools.islice(container.decode(stream), first + count):  # bounded even if the file is malicious
         ahead = round((frame.pts or 0) * tick * fps) - first - len(pictures)
         if ahead == 0:
-            pictures.append(frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False))
+            pictures.append(frame.to_ndarray(format="rgb24"))
         if ahead > 0 or len(pictures) == count:
             break
     if len(pictures) != count:

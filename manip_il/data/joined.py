@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from functools import reduce
 
@@ -44,12 +45,10 @@ class JoinedDatasets:
 
         Raises `ManipError` for an index without a text.
         """
-        places, found = {text: place for place, text in enumerate(self.tasks)}, list[I64]()
+        places = {text: place for place, text in enumerate(self.tasks)}
         pieces = np.split(own, np.cumsum([*map(len, self.datasets)])[:-1])
-        for dataset, piece in zip(self.datasets, pieces, strict=True):
-            numbers, which = np.unique(piece, return_inverse=True)
-            found.append(np.array([places[text] for text in dataset.texts(numbers)], np.int64)[which])
-        return np.concatenate(found)
+        texts = [dataset.texts(piece) for dataset, piece in zip(self.datasets, pieces, strict=True)]
+        return np.array([places[text] for text in itertools.chain(*texts)])
 
     def _statistics(self) -> Statistics:
         pooled = reduce(pool, (one.statistics for one in self.datasets))

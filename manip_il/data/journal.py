@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from mcap.records import Attachment, Chunk, DataEnd, Metadata
+from mcap.records import Attachment, DataEnd, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
@@ -120,14 +120,11 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
     """Read a file and verify its checksums."""
     values: dict[str, Any] = {}
     columns: dict[str, NDArray[Any]] = {}
-    chunks: list[Chunk] = []
     for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
         if isinstance(record, Metadata) and record.name == _RECORD:
             values = {name: json.loads(text) for name, text in record.metadata.items()}
         elif isinstance(record, Attachment):
             columns[record.name.removesuffix(_NPY)] = np.load(BytesIO(record.data), allow_pickle=False)
-        elif isinstance(record, Chunk):
-            chunks.append(record)
         elif isinstance(record, DataEnd):  # all checksums were verified
             break
     if (found := str(values.pop("format", None))) != _FORMAT:
@@ -135,9 +132,8 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
     spec = RobotTaskSpec.from_json(values.pop("spec"))
     journal = Journal(folder, spec, values.pop("fingerprint"))
     del values["frames"]
-    if spec.cameras:  # otherwise the messages are not needed
-        pictures = foxglove.read_images(chunks)
-        columns |= {IMAGES + camera: taken for camera, taken in pictures.items()}
+    pictures = foxglove.read_images(stream, spec.cameras)
+    columns |= {IMAGES + camera: taken for camera, taken in pictures.items()}
     return journal, Episode(columns=columns, **values)
 
 

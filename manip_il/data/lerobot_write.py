@@ -168,8 +168,8 @@ def _write_tables(
             with suppress(OSError):  # a full disk was already reported
                 one.close()
     for key, film in films.items():
-        if film.encodes:
-            features[key].setdefault("info", film.info())
+        if film.size:
+            features[key].setdefault("info", film.info(film.size))
     about = {  # in LeRobot's order
         "codebase_version": layout.VERSION,
         "fps": fps,

@@ -23,7 +23,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.camera import FrameRange, Pictures, open_video
 from manip_il.data.dataset import EpisodeData
 from manip_il.data.info import reading
-from manip_il.data.schema import exact_rate, plain_rate
+from manip_il.data.schema import exact_rate
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import UsageError
 
@@ -34,7 +34,7 @@ _OPTIONS = {"movflags": "faststart", "fflags": "+bitexact"}
 class CameraFiles:
     """Writes one camera's numbered video files, one at a time; the same episodes give the same bytes.
 
-    encodes: whether pictures were written, not only copied.
+    size: height and width of the written pictures [pixels]; None if films were only copied.
     """
 
     def __init__(self, folder: Path, key: str, config: VideoConfig, fps: float):
@@ -49,7 +49,7 @@ class CameraFiles:
         self._container: Any = None  # the open file
         self._stream: Any = None
         self._copied: dict[Any, dict[str, Any]] = {}  # source -> its place in the new dataset
-        self.encodes = False
+        self.size: tuple[int, int] | None = None
 
     def copy(self, episode: EpisodeData) -> dict[str, Any]:
         """Copy the video file that holds an episode, unless already copied; return the columns of its row."""
@@ -74,9 +74,8 @@ class CameraFiles:
         if self._bytes >= layout.VIDEO_FILES_SIZE_IN_MB * 2**20:
             self.close()
         path, place = self._next_file()
-        size = frames.shape[1], frames.shape[2]
+        self.size = size = frames.shape[1], frames.shape[2]
         if self._container is None:
-            self.encodes = True
             self._container = av.open(str(path), "w", options=_OPTIONS)
             self._stream = self._container.add_stream(self._config.vcodec, self._rate)
             encoder = self._stream.codec_context
@@ -100,22 +99,25 @@ class CameraFiles:
             self._bytes = 0
             container.close()
 
-    def info(self) -> dict[str, Any]:
-        """Return the entry of LeRobot's `info.json` for this camera; its first file must be closed."""
-        path, config = self._folder / layout.numbered(layout.VIDEO_PATH, 0, video_key=self._key)[0], self._config
-        with closing(open_video(path)) as container:
-            stream = container.streams.video[0]
-            found = {
-                "video.height": stream.height,
-                "video.width": stream.width,
-                "video.codec": stream.codec.canonical_name,
-                "video.pix_fmt": stream.pix_fmt,
-                "video.fps": plain_rate(float(stream.base_rate or 0)),
-                "video.channels": len(stream.format.components),
-                "has_audio": False,
-            }
-        settings = {"video.g": config.g, "video.crf": config.crf, "video.preset": config.preset, "video.fast_decode": 0}
-        return {**found, **settings, "video.video_backend": "pyav", "video.extra_options": {}, "is_depth_map": False}
+    def info(self, size: tuple[int, int]) -> dict[str, Any]:
+        """Return the entry of LeRobot's `info.json` for this camera. size: height and width [pixels]."""
+        config = self._config
+        return {
+            "video.height": size[0],
+            "video.width": size[1],
+            "video.codec": av.Codec(config.vcodec, "w").canonical_name,
+            "video.pix_fmt": config.pix_fmt,
+            "video.fps": self._fps,
+            "video.channels": 3,
+            "has_audio": False,
+            "video.g": config.g,
+            "video.crf": config.crf,
+            "video.preset": config.preset,
+            "video.fast_decode": 0,
+            "video.video_backend": "pyav",
+            "video.extra_options": {},
+            "is_depth_map": False,
+        }
 
     def _next_file(self) -> tuple[Path, dict[str, Any]]:
         """Return the path of the open or the next file, and its numbers in columns of `meta/episodes`."""
