@@ -25,9 +25,8 @@ def writing(path: Path) -> Generator[None]:
     """Raise `ManipError` if the disk is full or read-only. It names the file that failed, or `path` if unknown."""
     try:
         yield
-    except (
-        Exception
-    ) as error:  # errors of Arrow and FFmpeg are OSErrors, too; those of safetensors only name the number
+    except Exception as error:
+        # errors of Arrow and FFmpeg are OSErrors, too; those of safetensors only name the number
         named = re.search(r"os error (\d+)", str(error))
         number = getattr(error, "errno", None) or (int(named[1]) if named else None)
         if number not in _WRITE_ERRORS:
@@ -63,7 +62,8 @@ def new_folder(root: Path, *, replaces: str = "") -> Generator[Path]:
             _libc("syncfs", handle)  # one call for all files
             require_replaceable(root, replaces)
             if replaces and root.exists():
-                here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE: `root` exists at every moment
+                # AT_FDCWD and RENAME_EXCHANGE: `root` exists at every moment
+                here, exchange = -100, 2
                 _libc("renameat2", here, os.fsencode(new), here, os.fsencode(root), exchange)
             else:
                 new.rename(root)
@@ -110,7 +110,9 @@ def clear(folder: Path, keep: Path | None = None) -> None:
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write `content` to `path` as JSON, atomically as `write_file` does."""
-    write_file(path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode())
+    write_file(
+        path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode()
+    )
 
 
 def write_file(path: Path, data: bytes) -> None:

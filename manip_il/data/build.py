@@ -1,4 +1,4 @@
-"""Make datasets: from rollouts or journals, by merging datasets, or by replacing columns of one."""
+"""Make datasets: from rollouts or journals, or by merging datasets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from manip_il.data.fingerprint import compare_fingerprints, file_sha256
 from manip_il.data.info import PICTURES, Info, reading
 from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.data.lerobot_write import write_dataset, write_episodes
-from manip_il.data.parquet_files import Column
 from manip_il.data.schema import IMAGES, LABEL_VALID, check_same_spec
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, UnknownName, UsageError
@@ -32,7 +31,10 @@ from manip_il.mdp import KEYPOINTS, Episode
 _LOG = logging.getLogger(__name__)
 RECORDING = "recording.json"
 # settings of an encoder, which may differ between films of a camera
-_ENCODER = [f"video.{one}" for one in ("g", "crf", "preset", "fast_decode", "video_backend", "extra_options")]
+_ENCODER = [
+    f"video.{one}"
+    for one in ("g", "crf", "preset", "fast_decode", "video_backend", "extra_options")
+]
 Rollouts = Iterable[tuple[Journal, Episode]]
 
 
@@ -121,7 +123,11 @@ class Recording:
             provenance.update(seeds=[seeds[0], seeds[-1]], tried=len(seeds))
 
         video = VideoConfig(**self.video)
-        options: dict[str, Any] = {"fingerprint": about.fingerprint, "video": video, "replace": replace}
+        options: dict[str, Any] = {
+            "fingerprint": about.fingerprint,
+            "video": video,
+            "replace": replace,
+        }
         return write_dataset(selected(), root, about.spec, provenance, **options), len(failed)
 
 
@@ -192,7 +198,9 @@ def merge_datasets(
         if len(table) < len(one.stored_features):
             raise UsageError(f"--rename_map gives two columns of {one.root} the same name")
         for key, feature in table.items():
-            if features.setdefault(key, feature)["dtype"] == "image":  # encoded if others have films
+            if (
+                features.setdefault(key, feature)["dtype"] == "image"
+            ):  # encoded if others have films
                 features[key] = feature
 
     def chosen() -> Iterator[EpisodeData]:
@@ -205,7 +213,9 @@ def merge_datasets(
             before += dataset.info.episodes
 
     about = opened[0].fps, opened[0].info.robot, own
-    return write_episodes(chosen(), root, features, *about, tables=opened[0].other_tables, replace=replace)
+    return write_episodes(
+        chosen(), root, features, *about, tables=opened[0].other_tables, replace=replace
+    )
 
 
 def choose_episodes(words: Sequence[str], count: int) -> set[int]:
@@ -218,36 +228,11 @@ def choose_episodes(words: Sequence[str], count: int) -> set[int]:
         except ValueError:
             numbers = range(0)
         if not 0 <= numbers.start < numbers.stop <= count:
-            raise UsageError(f"--dataset.episodes has {checks.shorten(word)}; expected numbers and ranges in 0:{count}")
+            raise UsageError(
+                f"--dataset.episodes has {checks.shorten(word)}; expected numbers and ranges in 0:{count}"
+            )
         chosen.update(numbers)
     return chosen
-
-
-def rewrite_columns(
-    dataset: Dataset,
-    target: Path,
-    columns: Iterable[Mapping[str, Column]],
-    own: Own,
-    features: layout.Features,
-    *,
-    replace: bool = False,
-) -> Info:
-    """Write a dataset to `target` with some columns replaced; all other columns, texts and films stay the same.
-
-    Args:
-        dataset: The source.
-        target: The new folder.
-        columns: For every episode in stored order, name -> (T,) or (T, d), or pictures (T, height, width, 3).
-        own: The new dataset's description.
-        features: Its columns; those that `columns` lack are the source's.
-        replace: As in `new_folder`.
-    """
-    episodes = (
-        dataclasses.replace(one, columns={**one.columns, **fresh})
-        for one, fresh in zip(dataset.stored_episodes(), columns, strict=True)
-    )
-    about = dataset.fps, dataset.info.robot, own
-    return write_episodes(episodes, target, features, *about, tables=dataset.other_tables, replace=replace)
 
 
 def _merged_description(
@@ -260,11 +245,15 @@ def _merged_description(
     for one in opened:
         also = ("sim_state_size", "image_size", *(("task",) if one.own else ()))
         check_same_spec(str(about.root), about.spec, str(one.root), one.spec, also)
-        for warning in compare_fingerprints(str(opened[0].root), own, str(one.root), one.fingerprint):
+        for warning in compare_fingerprints(
+            str(opened[0].root), own, str(one.root), one.fingerprint
+        ):
             _LOG.warning("%s", warning)
     sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
     cameras = tuple(names.get(key, key).removeprefix(IMAGES) for key in about.spec.image_keys)
-    spec = dataclasses.replace(about.spec, cameras=cameras, video=any(one.spec.video for one in opened))
+    spec = dataclasses.replace(
+        about.spec, cameras=cameras, video=any(one.spec.video for one in opened)
+    )
     return Own(spec, own, {**provenance, "merged": sources})
 
 
@@ -286,7 +275,8 @@ def _check_same_facts(left: Dataset, right: Dataset, names: Mapping[str, str]) -
     ours, theirs = _facts(left, names), _facts(right, names)
     for what in {**ours, **theirs}:
         one, other = ours.get(what, "none"), theirs.get(what, "none")
-        is_unknown = what.startswith("film ") and "none" in (one, other)  # no film, or not described as fully
+        # no film, or not described as fully
+        is_unknown = what.startswith("film ") and "none" in (one, other)
         if one != other and not is_unknown:
             raise MismatchError(what, str(left.root), one, str(right.root), other)
 
@@ -297,7 +287,11 @@ def _facts(dataset: Dataset, names: Mapping[str, str]) -> dict[str, str]:
     for key, one in dataset.features.items():
         name, kind = names.get(key, key), "pictures" if one.dtype in PICTURES else one.dtype
         facts[f"column {name}"] = f"{kind} of shape {[*one.shape]}, named {one.names}"
-        facts |= {f"film {name}: {what}": str(value) for what, value in one.details.items() if what not in _ENCODER}
+        facts |= {
+            f"film {name}: {what}": str(value)
+            for what, value in one.details.items()
+            if what not in _ENCODER
+        }
     for key in {key for row in dataset.episodes.others for key in row} - {layout.DRAWN}:
         facts[f"column {key} of meta/episodes"] = "a column"
     for path in dataset.other_tables:

@@ -82,7 +82,10 @@ class Camera:
         starts = np.array([part.row for part in self.parts])
         which = np.searchsorted(starts, wanted, side="right") - 1
         cuts = np.flatnonzero((np.diff(wanted) != 1) | (np.diff(which) != 0)) + 1
-        found = [self._read(self.parts[which[at[0]]], wanted[at]) for at in np.split(np.arange(len(wanted)), cuts)]
+        found = [
+            self._read(self.parts[which[at[0]]], wanted[at])
+            for at in np.split(np.arange(len(wanted)), cuts)
+        ]
         return np.concatenate(found)[places.reshape(-1)]
 
     def _read(self, part: FrameRange, rows: I64) -> Pictures:
@@ -102,7 +105,9 @@ class Camera:
         return pictures
 
 
-def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = None) -> NDArray[np.uint8]:
+def decode(
+    cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = None
+) -> NDArray[np.uint8]:
     """Return all pictures of cameras, decoded with one thread per core, channels first: (N, 3, height, width).
 
     The array is a memory map of an unnamed temporary file, which is deleted with it. on_frames: called with the number
@@ -110,7 +115,8 @@ def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = 
     """
     shape = sum(camera.frames for camera in cameras), 3, *cameras[0].size
     with writing(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
-        os.posix_fallocate(file.fileno(), 0, math.prod(shape))  # otherwise a full disk kills the process
+        # otherwise a full disk kills the process
+        os.posix_fallocate(file.fileno(), 0, math.prod(shape))
         decoded = np.memmap(file, np.uint8, "r+", shape=shape)
     step = max(_PIECE, _PIECE_BYTES // math.prod(shape[1:]))
     pieces = list[tuple[Camera, I64, NDArray[np.uint8]]]()  # camera, rows, place of their pictures
@@ -135,7 +141,9 @@ def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = 
 def check_size(found: tuple[int, ...], size: tuple[int, int] | None) -> None:
     """Raise `ValueError` unless a picture's height and width are those in `info.json`, if these are given."""
     if size is not None and found != size:
-        raise ValueError(f"its pictures are {found[0]} x {found[1]}; expected {size[0]} x {size[1]}, as in info.json")
+        raise ValueError(
+            f"its pictures are {found[0]} x {found[1]}; expected {size[0]} x {size[1]}, as in info.json"
+        )
 
 
 def open_picture(
@@ -193,16 +201,21 @@ def read_frames(container: InputContainer, first: int, count: int, fps: float) -
     """
     stream = container.streams.video[0]
     tick = stream.time_base or 1  # [s]
-    container.seek(round(first / fps / tick), stream=stream)  # to the last key frame at or before it
+    # to the last key frame at or before it
+    container.seek(round(first / fps / tick), stream=stream)
     pictures: list[Any] = []
-    for frame in itertools.islice(container.decode(stream), first + count):  # bounded even if the file is malicious
+    for frame in itertools.islice(
+        container.decode(stream), first + count
+    ):  # bounded even if the file is malicious
         ahead = round((frame.pts or 0) * tick * fps) - first - len(pictures)
         if ahead == 0:
             pictures.append(frame.to_ndarray(format="rgb24"))
         if ahead > 0 or len(pictures) == count:
             break
     if len(pictures) != count:
-        raise ValueError(f"it has no frame {first + len(pictures)}; expected frames {first} to {first + count - 1}")
+        raise ValueError(
+            f"it has no frame {first + len(pictures)}; expected frames {first} to {first + count - 1}"
+        )
     return np.stack(pictures)
 
 

@@ -138,13 +138,25 @@ class Dataset:
         """
         if self.own is not None:
             one = len(self.tasks) == 1  # otherwise episodes have different instructions
-            return dataclasses.replace(self.own.spec, instruction=self.instruction) if one else self.own.spec
+            return (
+                dataclasses.replace(self.own.spec, instruction=self.instruction)
+                if one
+                else self.own.spec
+            )
         features = self.features
         if s.ACTION not in features:
-            raise ManipError(f"{self.root} has no column {s.ACTION}, so there is nothing to learn from it")
+            raise ManipError(
+                f"{self.root} has no column {s.ACTION}, so there is nothing to learn from it"
+            )
         around = features.get(s.ENVIRONMENT_STATE)
-        cameras = [features[key] for key in self.cameras if key.startswith(s.IMAGES) and features[key].is_rgb]
-        points = next((one.labels for key, one in features.items() if key.startswith(s.KEYPOINTS)), ())
+        cameras = [
+            features[key]
+            for key in self.cameras
+            if key.startswith(s.IMAGES) and features[key].is_rgb
+        ]
+        points = next(
+            (one.labels for key, one in features.items() if key.startswith(s.KEYPOINTS)), ()
+        )
         sizes = {one.picture_size for one in cameras}
         if len(sizes) > 1:  # a spec has one size for all cameras
             cameras = []
@@ -199,7 +211,9 @@ class Dataset:
             found.append(FrameRange(path, 0, count_rows(path), rows))
             rows += found[-1].count
         if rows != len(self) or not found:
-            raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {rows}")
+            raise ManipError(
+                f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {rows}"
+            )
         return found
 
     def columns(self, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
@@ -232,13 +246,17 @@ class Dataset:
             raise UnknownName(f"camera in {self.root}", key, self.cameras)
         feature = self.features[key]
         if not feature.is_rgb:
-            raise ManipError(f"{key} of {self.root} has shape {feature.shape}; expected RGB pictures")
+            raise ManipError(
+                f"{key} of {self.root} has shape {feature.shape}; expected RGB pictures"
+            )
         films = feature.dtype == "video"
         found = self._film_ranges(key) if films else self._cells
         parts = sorted((part for part in found if part.count), key=lambda part: part.row)
         ends = np.cumsum([0, *(part.count for part in parts)]).tolist()
         if [*(part.row for part in parts), len(self)] != ends:
-            raise ManipError(f"{self.root}: the files of {key} do not hold each of the {len(self)} frames exactly once")
+            raise ManipError(
+                f"{self.root}: the files of {key} do not hold each of the {len(self)} frames exactly once"
+            )
         return Camera(key, self.fps, feature.picture_size, films, tuple(parts))
 
     def _film_ranges(self, key: str) -> list[FrameRange]:
@@ -256,7 +274,9 @@ class Dataset:
     def rows_of(self, episode: int) -> I64:
         """Return the rows of an episode, (T,). Raises `UsageError` if it does not exist."""
         if not 0 <= episode < self.info.episodes:
-            raise UsageError(f"{self.root} has no episode {episode}; it has 0 to {self.info.episodes - 1}")
+            raise UsageError(
+                f"{self.root} has no episode {episode}; it has 0 to {self.info.episodes - 1}"
+            )
         table = self.episodes
         [place] = np.flatnonzero(table.index == episode)[:1]
         return np.arange(table.start[place], table.start[place] + table.length[place])
@@ -264,17 +284,23 @@ class Dataset:
     @property
     def stored_features(self) -> layout.Features:
         """The features in `info.json`, with everything that it says of them, without LeRobot's index columns."""
-        return {key: one.table for key, one in self.features.items() if key not in layout.INDEX_DTYPES}
+        return {
+            key: one.table for key, one in self.features.items() if key not in layout.INDEX_DTYPES
+        }
 
     @property
     def other_tables(self) -> list[Path]:
         """The tables in `meta/` that are not LeRobot's, such as texts of subtasks."""
-        return [path for path in self.root.glob("meta/*.parquet") if path != self.root / layout.TASKS]
+        return [
+            path for path in self.root.glob("meta/*.parquet") if path != self.root / layout.TASKS
+        ]
 
     def texts(self, numbers: I64) -> list[str]:
         """Return the task text of each `task_index`, (T,). Raises `ManipError` for an index without a text."""
         if missing := set(numbers.tolist()) - self.tasks.keys():
-            raise ManipError(f"{self.root}: rows have task {min(missing)}, which {layout.TASKS} lacks")
+            raise ManipError(
+                f"{self.root}: rows have task {min(missing)}, which {layout.TASKS} lacks"
+            )
         return [self.tasks[number] for number in numbers.tolist()]
 
     def stored_episodes(
@@ -286,7 +312,11 @@ class Dataset:
         new names of columns and cameras.
         """
         if names is None:
-            names = [key for key, one in self.features.items() if one.dtype != "video" and key not in _NUMBERED]
+            names = [
+                key
+                for key, one in self.features.items()
+                if one.dtype != "video" and key not in _NUMBERED
+            ]
         new = {key: (renamed or {}).get(key, key) for key in self.features}
         table = self.episodes
         films = {key: self._film_ranges(key) for key in table.clips}
@@ -295,7 +325,9 @@ class Dataset:
         for cells in self._cells:
             columns = self._read(cells.path, [*names, layout.TASK_INDEX])
             texts = self.texts(columns.pop(layout.TASK_INDEX))
-            for place in np.flatnonzero((table.start >= cells.row) & (table.start < cells.row + cells.count)):
+            for place in np.flatnonzero(
+                (table.start >= cells.row) & (table.start < cells.row + cells.count)
+            ):
                 rows = slice(table.start[place] - cells.row, table.stop[place] - cells.row)
                 yield EpisodeData(
                     columns={new[name]: column[rows] for name, column in columns.items()},

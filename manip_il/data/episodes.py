@@ -45,7 +45,10 @@ def to_episode(
             the executed action as label.
         path: Number of leading frames that decide success; by default all.
     """
-    rows = [_row(frame, labelled=labelled) | {schema.ROUND: round_, schema.BETA: beta} for frame in frames]
+    rows = [
+        _row(frame, labelled=labelled) | {schema.ROUND: round_, schema.BETA: beta}
+        for frame in frames
+    ]
     columns: dict[str, NDArray[Any]] = {}
     for key in rows[0]:
         column = np.array([row[key] for row in rows])
@@ -94,6 +97,13 @@ def parts(episode: Episode) -> list[Episode]:
     for end in ends.tolist():
         columns = {key: column[start:end] for key, column in episode.columns.items()}
         solved = columns[schema.SUCCESS]
-        found.append(replace(episode, columns=columns, success=bool(solved.any()), success_at_end=bool(solved[-1])))
+        found.append(
+            replace(
+                episode,
+                columns=columns,
+                success=bool(solved.any()),
+                success_at_end=bool(solved[-1]),
+            )
+        )
         start = end
     return found or [episode]

@@ -33,7 +33,11 @@ Messages = Iterator[Message | str]  # one per frame, all of one class; scalars a
 
 NANOSECONDS = 1_000_000_000
 IMAGE_TOPICS = "/observation/images/"  # prefix of a camera's topic, as in LeRobot
-_JOINT_TOPICS = {"/joint_states": s.STATE, "/action": s.ACTION, "/executed_action": s.EXECUTED_ACTION}
+_JOINT_TOPICS = {
+    "/joint_states": s.STATE,
+    "/action": s.ACTION,
+    "/executed_action": s.EXECUTED_ACTION,
+}
 _SCALARS = (s.ACTOR, s.EXPERT_PHASE, s.LABEL_VALID, s.REWARD, s.SUCCESS, s.DONE)
 
 # copied from LeRobot (`lerobot.utils.foxglove_visualization`)
@@ -52,7 +56,10 @@ def frame_times(count: int, rate: Fraction) -> list[int]:
 def joint_states(names: Sequence[str], values: NDArray[Any], times: Times) -> Messages:
     """Yield one message per row of the positions (T, n) of named joints."""
     for time, row in zip(times, values.tolist(), strict=True):
-        joints = [JointState(name=name, position=position) for name, position in zip(names, row, strict=True)]
+        joints = [
+            JointState(name=name, position=position)
+            for name, position in zip(names, row, strict=True)
+        ]
         yield JointStates(timestamp=_stamp(time), joints=joints)
 
 
@@ -60,7 +67,8 @@ def scalars(labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Messages:
     """Yield one JSON message of labelled numbers per row. rows: T rows of Python numbers, which must be finite."""
     for row in rows:
         pairs = zip(labels, row, strict=True)
-        yield json.dumps({"scalars": [{"label": label, "value": +value} for label, value in pairs]})  # + for bools
+        # + for bools
+        yield json.dumps({"scalars": [{"label": label, "value": +value} for label, value in pairs]})
 
 
 def images(frame_id: str, pictures: Iterable[U8], times: Times) -> Messages:
@@ -92,7 +100,11 @@ def _stamp(time: int) -> Timestamp:
 def episode_channels(episode: Episode, times: Times, joints: Sequence[str]) -> dict[str, Messages]:
     """Return the messages of the episode's columns by topic. joints: the names of the joints."""
     columns = episode.columns
-    found = {topic: joint_states(joints, columns[key], times) for topic, key in _JOINT_TOPICS.items() if key in columns}
+    found = {
+        topic: joint_states(joints, columns[key], times)
+        for topic, key in _JOINT_TOPICS.items()
+        if key in columns
+    }
     if numbers := {key: columns[key].reshape(-1) for key in _SCALARS if key in columns}:
         rows = zip(*(column.tolist() for column in numbers.values()), strict=True)
         found["/scalars"] = scalars(list(numbers), rows)
@@ -107,15 +119,27 @@ def add_channels(writer: Writer, channels: Mapping[str, Messages], times: Times)
     """Write all messages, frame by frame. channels: topic -> messages."""
     schemas: dict[type, int] = {}  # class of messages -> its schema
     ids: dict[str, int] = {}
-    for frame, (time, messages) in enumerate(zip(times, zip(*channels.values(), strict=True), strict=bool(channels))):
+    for frame, (time, messages) in enumerate(
+        zip(times, zip(*channels.values(), strict=True), strict=bool(channels))
+    ):
         for topic, message in zip(channels, messages, strict=True):
             kind = type(message)
             if kind not in schemas:
                 scalars = _SCALARS_NAME, "jsonschema", _SCALARS_SCHEMA
-                schemas[kind] = writer.register_schema(*scalars) if kind is str else register_schema(writer, kind)
+                schemas[kind] = (
+                    writer.register_schema(*scalars)
+                    if kind is str
+                    else register_schema(writer, kind)
+                )
             if topic not in ids:
-                ids[topic] = writer.register_channel(topic, "json" if kind is str else "protobuf", schemas[kind])
-            data = message.encode() if isinstance(message, str) else message.SerializeToString(deterministic=True)
+                ids[topic] = writer.register_channel(
+                    topic, "json" if kind is str else "protobuf", schemas[kind]
+                )
+            data = (
+                message.encode()
+                if isinstance(message, str)
+                else message.SerializeToString(deterministic=True)
+            )
             writer.add_message(ids[topic], time, data, time, frame)
 
 

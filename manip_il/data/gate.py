@@ -25,7 +25,10 @@ from manip_il.data.info import Feature, read_info
 from manip_il.errors import ManipError
 
 _DEPTH = (*FORMATS, "TIFF")  # this program does not decode TIFF
-_PLAIN = ("Value", "ClassLabel", "List", "LargeList", "Sequence", "Json", "Array2D", "Array3D", "Array4D", "Array5D")
+_PLAIN = (
+    *("Value", "ClassLabel", "List", "LargeList", "Sequence", "Json"),
+    *("Array2D", "Array3D", "Array4D", "Array5D"),
+)
 _TYPE = re.compile(r'"_type": "?([^",}\]]*)')  # in the JSON from which `datasets` makes a feature
 _BATCH = 64  # rows in memory at once
 
@@ -94,7 +97,9 @@ def _check_columns(schema: pa.Schema, pictures: Collection[str], structs: Collec
     for key, feature in about.get("info", {}).get("features", {}).items():
         allowed = (*_PLAIN, "Image") if key in pictures else _PLAIN
         if not {*_TYPE.findall(json.dumps(feature))} <= {*allowed}:
-            raise ValueError(f"column {key!r} is decoded as {checks.shorten(feature)}; expected plain values")
+            raise ValueError(
+                f"column {key!r} is decoded as {checks.shorten(feature)}; expected plain values"
+            )
 
 
 def _is_plain(kind: pa.DataType) -> bool:

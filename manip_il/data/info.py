@@ -53,14 +53,27 @@ class Feature:
         """A name for each value: from `info.json` (a list, or lists by group), else `<column>.<index>`."""
         names: Any = self.names
         groups = cast(dict[str, Any], names).values() if isinstance(names, dict) else [names]
-        found = [str(name) for group in groups if isinstance(group, list) for name in cast(list[Any], group)]
-        return tuple(found) if len(found) == self.size else tuple(f"{self.key}.{place}" for place in range(self.size))
+        found = [
+            str(name)
+            for group in groups
+            if isinstance(group, list)
+            for name in cast(list[Any], group)
+        ]
+        return (
+            tuple(found)
+            if len(found) == self.size
+            else tuple(f"{self.key}.{place}" for place in range(self.size))
+        )
 
     @property
     def is_rgb(self) -> bool:
         """Whether it is a camera with RGB pictures, not depth."""
         depth = self.details.get("is_depth_map") or self.details.get("video.is_depth_map")
-        return self.dtype in PICTURES and 3 * math.prod(self.picture_size) == self.size > 0 and not depth
+        return (
+            self.dtype in PICTURES
+            and 3 * math.prod(self.picture_size) == self.size > 0
+            and not depth
+        )
 
     @property
     def picture_size(self) -> tuple[int, int]:
@@ -96,7 +109,9 @@ def reading(path: Path) -> Generator[None]:
         if isinstance(error, ManipError) and str(path) in str(error):
             raise
         reason = getattr(error, "strerror", None) or checks.one_line(error) or type(error).__name__
-        raise ManipError(f"cannot read {path}: {reason}; run `manip-il data check` to see what is wrong") from error
+        raise ManipError(
+            f"cannot read {path}: {reason}; run `manip-il data check` to see what is wrong"
+        ) from error
 
 
 def read_info(root: Path) -> Info:
@@ -111,11 +126,15 @@ def read_info(root: Path) -> Info:
     version = raw.get("codebase_version")
     if version != layout.VERSION:
         older = "; LeRobot converts datasets of v2.1" if version == "v2.1" else ""
-        raise ManipError(f"{path}: codebase_version is {checks.shorten(version)}; expected {layout.VERSION!r}{older}")
+        raise ManipError(
+            f"{path}: codebase_version is {checks.shorten(version)}; expected {layout.VERSION!r}{older}"
+        )
     with reading(path):
         for key, template in _PATHS.items():
             if (found := raw.get(key) or template) != template:
-                raise ManipError(f"{key} is {checks.shorten(found)}; expected {template!r}, as LeRobot names its files")
+                raise ManipError(
+                    f"{key} is {checks.shorten(found)}; expected {template!r}, as LeRobot names its files"
+                )
         tasks = raw.get("total_tasks")
         return Info(
             fps=checks.number("fps", raw["fps"], 1, 1e6),

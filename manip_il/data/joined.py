@@ -14,7 +14,8 @@ from manip_il.data.lerobot_layout import Features
 from manip_il.data.statistics import Statistics, pool
 from manip_il.mdp import I64
 
-_IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}  # from LeRobot, for every camera
+# from LeRobot, for every camera
+_IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}
 
 
 class JoinedDatasets:
@@ -32,13 +33,18 @@ class JoinedDatasets:
         self.features: Features = {
             key: {"dtype": one.dtype, "shape": one.shape, "names": one.names}
             for key, one in first.features.items()
-            if all(key in other.features and other.features[key].shape == one.shape for other in self.datasets)
+            if all(
+                key in other.features and other.features[key].shape == one.shape
+                for other in self.datasets
+            )
             and (one.is_rgb or one.dtype not in PICTURES)
         }
         self.camera_keys = [key for key, one in self.features.items() if one["dtype"] in PICTURES]
         self.total_frames = sum(map(len, self.datasets))
         self.stats = self._statistics()
-        self.tasks = list(dict.fromkeys(text for one in self.datasets for text in one.tasks.values()))
+        self.tasks = list(
+            dict.fromkeys(text for one in self.datasets for text in one.tasks.values())
+        )
 
     def joint_tasks(self, own: I64) -> I64:
         """Return every frame's index in `tasks`, (N,), given its `task_index` in its own dataset, (N,).
@@ -53,6 +59,11 @@ class JoinedDatasets:
     def _statistics(self) -> Statistics:
         pooled = reduce(pool, (one.statistics for one in self.datasets))
         numbers = {key: pooled[key] for key in self.features if key in pooled}
-        imagenet = {name: np.array(values, np.float32).reshape(3, 1, 1) for name, values in _IMAGENET.items()}
-        cameras = {key: self.datasets[0].statistics.get(key, {}) | imagenet for key in self.camera_keys}
+        imagenet = {
+            name: np.array(values, np.float32).reshape(3, 1, 1)
+            for name, values in _IMAGENET.items()
+        }
+        cameras = {
+            key: self.datasets[0].statistics.get(key, {}) | imagenet for key in self.camera_keys
+        }
         return numbers | cameras

@@ -57,7 +57,9 @@ class Journal:
             if not key.startswith(IMAGES):  # pictures are stored as lossless messages
                 numbers = BytesIO()
                 np.save(numbers, column, allow_pickle=False)
-                writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", numbers.getvalue())
+                writer.add_attachment(
+                    0, 0, key + _NPY, "application/octet-stream", numbers.getvalue()
+                )
         writer.finish()
         return stream.getvalue()
 
@@ -84,7 +86,9 @@ class Journal:
         there, _ = read_journal(paths[0])
         here, also = f"{self.spec.robot} {self.spec.task}", ("task", "cameras", "image_size")
         check_same_spec(str(self.folder), there.spec, here, self.spec, also)
-        return compare_fingerprints(str(self.folder), there.fingerprint, "this machine", self.fingerprint)
+        return compare_fingerprints(
+            str(self.folder), there.fingerprint, "this machine", self.fingerprint
+        )
 
 
 def episode_path(folder: Path, seed: int) -> Path:
@@ -94,7 +98,11 @@ def episode_path(folder: Path, seed: int) -> Path:
 
 def list_seeds(folder: Path) -> list[int]:
     """Return the seeds of the folder's finished episodes, in order; [] if the folder does not exist."""
-    return sorted(int(match[1]) for path in folder.glob("episode-*.mcap") if (match := _NAME.fullmatch(path.name)))
+    return sorted(
+        int(match[1])
+        for path in folder.glob("episode-*.mcap")
+        if (match := _NAME.fullmatch(path.name))
+    )
 
 
 def list_episodes(folder: Path) -> list[Path]:
@@ -110,7 +118,9 @@ def read_journal(path: Path) -> tuple[Journal, Episode]:
     try:
         with checks.open_outside(path, "a journal") as stream:
             return _read(path.parent, stream)
-    except Exception as error:  # a foreign file with valid checksums can make a parser raise anything
+    except (
+        Exception
+    ) as error:  # a foreign file with valid checksums can make a parser raise anything
         why = checks.one_line(error) or type(error).__name__
         again = "delete it; --resume=true records it again"
         raise ManipError(f"{path} is not a complete episode: {why}; {again}") from error
@@ -124,7 +134,9 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
         if isinstance(record, Metadata) and record.name == _RECORD:
             values = {name: json.loads(text) for name, text in record.metadata.items()}
         elif isinstance(record, Attachment):
-            columns[record.name.removesuffix(_NPY)] = np.load(BytesIO(record.data), allow_pickle=False)
+            columns[record.name.removesuffix(_NPY)] = np.load(
+                BytesIO(record.data), allow_pickle=False
+            )
         elif isinstance(record, DataEnd):  # all checksums were verified
             break
     if (found := str(values.pop("format", None))) != _FORMAT:

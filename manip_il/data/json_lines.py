@@ -23,7 +23,10 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     lines = checks.read_bytes(path, "JSON lines").splitlines(keepends=True) if path.exists() else []
     whole = [line for line in lines if line.endswith(b"\n")]
     names = (f"{path}, line {number}" for number in itertools.count(1))
-    return [checks.mapping(name, checks.parse_json(name, line)) for name, line in zip(names, whole, strict=False)]
+    return [
+        checks.mapping(name, checks.parse_json(name, line))
+        for name, line in zip(names, whole, strict=False)
+    ]
 
 
 def append_line(path: Path, record: Record) -> None:
@@ -38,7 +41,10 @@ def append_line(path: Path, record: Record) -> None:
 
 
 def _finite(record: Record) -> dict[str, Any]:
-    return {key: None if isinstance(one, float) and not math.isfinite(one) else one for key, one in record.items()}
+    return {
+        key: None if isinstance(one, float) and not math.isfinite(one) else one
+        for key, one in record.items()
+    }
 
 
 def _plain(value: Any) -> Any:

@@ -28,7 +28,13 @@ from manip_il.data.info import PICTURES, Info, read_info, reading
 from manip_il.data.ownership import DATASET
 from manip_il.data.parquet_files import Column, ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, features, plain_rate
-from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, pool, to_lists
+from manip_il.data.statistics import (
+    Statistics,
+    column_statistics,
+    picture_statistics,
+    pool,
+    to_lists,
+)
 from manip_il.data.video import CameraFiles
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError
@@ -70,14 +76,18 @@ def write_dataset(
         for episode in episodes:
             columns = episode.columns
             if table.keys() != columns.keys():
-                raise MismatchError("list of columns", f"seed {episode.seed}", [*columns], "the dataset", [*table])
+                raise MismatchError(
+                    "list of columns", f"seed {episode.seed}", [*columns], "the dataset", [*table]
+                )
             text = checks.text("instruction", episode.instruction or spec.instruction)
             drawn = {layout.DRAWN: json.dumps(dict(episode.drawn))}
             yield EpisodeData(columns, [text] * len(episode), drawn)
 
     own = Own(spec, fingerprint, {} if provenance is None else provenance)
     robot = spec.robot_type or spec.robot
-    return write_episodes(described(), root, table, spec.fps, robot, own, video=video, replace=replace)
+    return write_episodes(
+        described(), root, table, spec.fps, robot, own, video=video, replace=replace
+    )
 
 
 def write_episodes(
@@ -142,18 +152,27 @@ def _write_tables(
 ) -> None:
     """Write all of LeRobot's files into a folder."""
     index: layout.Features = {
-        key: {"dtype": kind, "shape": (1,), "names": None} for key, kind in layout.INDEX_DTYPES.items()
+        key: {"dtype": kind, "shape": (1,), "names": None}
+        for key, kind in layout.INDEX_DTYPES.items()
     }
-    features = {key: {**one, "shape": tuple(one["shape"])} for key, one in {**features, **index}.items()}
+    features = {
+        key: {**one, "shape": tuple(one["shape"])} for key, one in {**features, **index}.items()
+    }
     fps = plain_rate(fps)
     data = ParquetFiles(folder, layout.DATA_PATH, _GROUP_ROWS)
     meta = ParquetFiles(folder, layout.EPISODES_PATH)
-    films = {key: CameraFiles(folder, key, video, fps) for key, one in features.items() if one["dtype"] == "video"}
+    films = {
+        key: CameraFiles(folder, key, video, fps)
+        for key, one in features.items()
+        if one["dtype"] == "video"
+    }
     files = (data, meta, *films.values())
     totals = _Totals()
     try:
         schema: pa.Schema | None = None  # that of the first rows
-        for rows in itertools.batched(_rows(episodes, features, fps, data, films, totals), _GROUP_EPISODES):
+        for rows in itertools.batched(
+            _rows(episodes, features, fps, data, films, totals), _GROUP_EPISODES
+        ):
             chunk, file = meta.next_place()
             place = {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
             table = pa.Table.from_pylist([row | place for row in rows], schema)
@@ -249,7 +268,9 @@ def _fit(
         if key not in given:  # a film that is copied
             continue
         values = given[key]
-        if feature["dtype"] == "video" and isinstance(values, pa.ChunkedArray):  # PNGs become a film
+        if feature["dtype"] == "video" and isinstance(
+            values, pa.ChunkedArray
+        ):  # PNGs become a film
             with reading(Path(key)):
                 values = np.stack([decode_picture(cell["bytes"]) for cell in values.to_pylist()])
         if isinstance(values, np.ndarray):

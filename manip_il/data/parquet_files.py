@@ -30,7 +30,9 @@ from manip_il.mdp import F64, I64
 Column = Any  # numpy array, (T,) or (T, ...); of datasets, all but numbers are Arrow arrays
 
 # LeRobot's columns of `meta/episodes`
-_EPISODE_COLUMNS = re.compile(r"episode_index|tasks|length|dataset_(from|to)_index|(data|meta|stats|videos)/.*")
+_EPISODE_COLUMNS = re.compile(
+    r"episode_index|tasks|length|dataset_(from|to)_index|(data|meta|stats|videos)/.*"
+)
 
 
 class ParquetFiles:
@@ -70,7 +72,8 @@ class ParquetFiles:
         if self._waiting:
             self._flush()
         if self._writer is not None:
-            writer, self._writer = self._writer, None  # first, so that an error on closing is raised once
+            writer = self._writer
+            self._writer = None  # first, so that an error on closing is raised once
             writer.close()
             self._number += 1
 
@@ -80,7 +83,9 @@ class ParquetFiles:
         if self._writer is None:
             self._path = self._folder / layout.numbered(self._template, self._number)[0]
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            repeating: Any = [field.name for field in table.schema if not pa.types.is_nested(field.type)]
+            repeating: Any = [
+                field.name for field in table.schema if not pa.types.is_nested(field.type)
+            ]
             self._writer = pq.ParquetWriter(
                 *(self._path, table.schema),
                 compression="snappy",
@@ -98,12 +103,18 @@ def to_table(columns: Mapping[str, Column], schema: pa.Schema) -> pa.Table:
         if isinstance(values, pa.ChunkedArray):
             arrays.append(values.cast(column.type))
         elif column.type == layout.PICTURE:
-            arrays.append(pa.array([{"bytes": _to_png(picture), "path": None} for picture in values], column.type))
+            arrays.append(
+                pa.array(
+                    [{"bytes": _to_png(picture), "path": None} for picture in values], column.type
+                )
+            )
         elif values.ndim > 2:
             arrays.append(pa.array(values.tolist(), column.type))
         elif values.ndim > 1:
             flat = pa.array(np.ascontiguousarray(values).reshape(-1), column.type.value_type)
-            arrays.append(pa.FixedSizeListArray.from_arrays(flat, values.shape[1]).cast(column.type))
+            arrays.append(
+                pa.FixedSizeListArray.from_arrays(flat, values.shape[1]).cast(column.type)
+            )
         else:
             arrays.append(pa.array(values, column.type))
     return pa.Table.from_arrays(arrays, schema=schema)
@@ -112,7 +123,8 @@ def to_table(columns: Mapping[str, Column], schema: pa.Schema) -> pa.Table:
 def _to_png(picture: NDArray[np.uint8]) -> bytes:
     """Return a picture (height, width, 3) as the content of a PNG file."""
     stream = BytesIO()
-    Image.fromarray(picture).save(stream, "PNG", compress_level=1)  # higher levels save a tenth and take twice as long
+    # higher levels save a tenth and take twice as long
+    Image.fromarray(picture).save(stream, "PNG", compress_level=1)
     return stream.getvalue()
 
 
@@ -153,7 +165,13 @@ def read_tasks(root: Path) -> dict[int, str]:
         names = column_names(path)
         table = read_file(path, names)
         name = "task" if "task" in names else names[-1]  # pandas writes the index after the columns
-        return dict(zip(table.column(layout.TASK_INDEX).to_pylist(), table.column(name).to_pylist(), strict=True))
+        return dict(
+            zip(
+                table.column(layout.TASK_INDEX).to_pylist(),
+                table.column(name).to_pylist(),
+                strict=True,
+            )
+        )
 
 
 def to_numpy(column: pa.ChunkedArray, feature: Feature) -> Column:
@@ -166,13 +184,18 @@ def to_numpy(column: pa.ChunkedArray, feature: Feature) -> Column:
     array: Any = column.combine_chunks()
     is_vector = feature.size > 1
     while isinstance(array, pa.ExtensionArray | pa.ListArray | pa.FixedSizeListArray):
-        array, is_vector = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten(), True
+        array = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten()
+        is_vector = True
     try:  # files may hold narrower numbers
-        values = array.to_numpy(zero_copy_only=False).astype(feature.dtype, casting="same_kind", copy=False)
+        values = array.to_numpy(zero_copy_only=False).astype(
+            feature.dtype, casting="same_kind", copy=False
+        )
         return values.reshape(len(column), *feature.shape if is_vector else ())
     except (TypeError, ValueError) as error:
         what = f"{feature.dtype} of shape {list(feature.shape)}"
-        raise ValueError(f"{feature.key!r} does not hold {what} in each of {len(column):,} rows: {error}") from error
+        raise ValueError(
+            f"{feature.key!r} does not hold {what} in each of {len(column):,} rows: {error}"
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -219,7 +242,12 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
             ]
             return VideoSpans(paths, table.column(f"videos/{key}/from_timestamp").to_numpy())
 
-        tasks = table.column("tasks").to_pylist() if "tasks" in table.column_names else [None] * len(table)
+        tasks = (
+            table.column("tasks").to_pylist()
+            if "tasks" in table.column_names
+            else [None] * len(table)
+        )
+        others = [name for name in table.column_names if not _EPISODE_COLUMNS.fullmatch(name)]
         return EpisodeTable(
             index=numbers(layout.EPISODE_INDEX),
             length=numbers("length"),
@@ -227,7 +255,7 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
             stop=numbers("dataset_to_index"),
             tasks=[texts or [] for texts in tasks],
             clips={feature.key: clips(feature.key) for feature in info.of_dtype("video")},
-            others=table.select([one for one in table.column_names if not _EPISODE_COLUMNS.fullmatch(one)]).to_pylist(),
+            others=table.select(others).to_pylist(),
         )
 
 
@@ -235,7 +263,9 @@ def read_picture_statistics(root: Path, cameras: Sequence[str]) -> list[Statisti
     """Return the stored statistics of every episode's pictures, by camera column."""
     found: list[Statistics] = []
     columns = {f"stats/{key}/{name}": (key, name) for key in cameras for name in layout.STAT_NAMES}
-    for row in _read_rows(root, lambda name: name in columns or name == layout.EPISODE_INDEX).to_pylist():
+    for row in _read_rows(
+        root, lambda name: name in columns or name == layout.EPISODE_INDEX
+    ).to_pylist():
         own: Statistics = {}
         for column, (key, name) in columns.items():
             if row.get(column) is not None:

@@ -32,7 +32,12 @@ def column_statistics(columns: Mapping[str, NDArray[Any]]) -> Statistics:
     statistics: Statistics = {}
     for key, values in columns.items():
         rows = np.array(values.reshape(len(values), -1).T, np.float64, order="C")
-        own = {"min": rows.min(axis=1), "max": rows.max(axis=1), "mean": rows.mean(axis=1), "std": rows.std(axis=1)}
+        own = {
+            "min": rows.min(axis=1),
+            "max": rows.max(axis=1),
+            "mean": rows.mean(axis=1),
+            "std": rows.std(axis=1),
+        }
         places = quantile_places(len(values))
         rows.partition(sorted(set(places.values())), axis=1)
         own |= {name: rows[:, place].copy() for name, place in places.items()}
@@ -56,7 +61,9 @@ def picture_statistics(frames: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         **{name: (below > place).argmax(axis=1) for name, place in places.items()},
     }
     shaped = {name: values.reshape(3, 1, 1) / 255 for name, values in levels.items()}
-    return {name: np.array([len(frames)]) if name == "count" else shaped[name] for name in STAT_NAMES}
+    return {
+        name: np.array([len(frames)]) if name == "count" else shaped[name] for name in STAT_NAMES
+    }
 
 
 def quantile_places(count: int) -> dict[str, int]:
@@ -72,10 +79,14 @@ def pool(one: Statistics, other: Statistics) -> Statistics:
     return {key: _pool(one[key], other[key]) for key in one if key in other}
 
 
-def _pool(old: Mapping[str, NDArray[Any]], new: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _pool(
+    old: Mapping[str, NDArray[Any]], new: Mapping[str, NDArray[Any]]
+) -> dict[str, NDArray[Any]]:
     count = old["count"] + new["count"]
     share, apart = new["count"] / count, new["mean"] - old["mean"]
-    spread = (1 - share) * old["std"] ** 2 + share * new["std"] ** 2 + share * (1 - share) * apart**2
+    spread = (
+        (1 - share) * old["std"] ** 2 + share * new["std"] ** 2 + share * (1 - share) * apart**2
+    )
     found = {"min": np.minimum(old["min"], new["min"]), "max": np.maximum(old["max"], new["max"])}
     found |= {"std": np.sqrt(spread), "count": count}
     means = [name for name in ("mean", *QUANTILES) if name in old and name in new]
@@ -85,7 +96,10 @@ def _pool(old: Mapping[str, NDArray[Any]], new: Mapping[str, NDArray[Any]]) -> d
 
 def to_lists(statistics: Statistics) -> dict[str, dict[str, list[Any]]]:
     """Return statistics as plain lists, as in `meta/stats.json`."""
-    return {key: {name: values.tolist() for name, values in table.items()} for key, table in statistics.items()}
+    return {
+        key: {name: values.tolist() for name, values in table.items()}
+        for key, table in statistics.items()
+    }
 
 
 def read_statistics(root: Path) -> Statistics:
@@ -94,6 +108,9 @@ def read_statistics(root: Path) -> Statistics:
     with reading(path):
         found = checks.read_json(path, "a dataset's statistics")
         return {
-            key: {name: np.atleast_1d(np.asarray(values, np.float64)) for name, values in table.items()}
+            key: {
+                name: np.atleast_1d(np.asarray(values, np.float64))
+                for name, values in table.items()
+            }
             for key, table in found.items()
         }

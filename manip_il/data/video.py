@@ -124,7 +124,10 @@ class CameraFiles:
         name, chunk, file = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
         path = self._folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        return path, {f"videos/{self._key}/chunk_index": chunk, f"videos/{self._key}/file_index": file}
+        return path, {
+            f"videos/{self._key}/chunk_index": chunk,
+            f"videos/{self._key}/file_index": file,
+        }
 
     def _times(self, first: int, count: int) -> dict[str, Any]:
         return {
@@ -149,7 +152,8 @@ def _cut(film: FrameRange, target: Path, fps: float) -> None:
         stream = source.streams.video[0]
         own = container.add_stream_from_template(stream, opaque=True)
         rate = fps * float(stream.time_base or 1)  # [frames/tick]
-        source.seek(round(film.first / rate), stream=stream)  # to the last key frame at or before it
+        # to the last key frame at or before it
+        source.seek(round(film.first / rate), stream=stream)
         inside = (
             packet
             for packet in source.demux(stream)
@@ -158,7 +162,9 @@ def _cut(film: FrameRange, target: Path, fps: float) -> None:
         packets: list[Any] = [*itertools.islice(inside, film.count)]
         if len(packets) != film.count or not packets[0].is_keyframe:
             last = film.first + film.count - 1
-            raise ValueError(f"frames {film.first} to {last} cannot be cut out without encoding them again")
+            raise ValueError(
+                f"frames {film.first} to {last} cannot be cut out without encoding them again"
+            )
         start = packets[0].pts or 0
         for packet in packets:
             packet.pts = (packet.pts or 0) - start
@@ -183,7 +189,8 @@ def _encode(encoder: Any, frame: av.VideoFrame | None) -> list[Any]:
 
 
 def _set_up(encoder: Any, config: VideoConfig, size: tuple[int, int], rate: Fraction) -> None:
-    os.environ.setdefault("SVT_LOG", "1")  # errors only; otherwise it prints its version for every encoder
+    # errors only; otherwise it prints its version for every encoder
+    os.environ.setdefault("SVT_LOG", "1")
     encoder.options = config.options()
     encoder.height, encoder.width = size
     encoder.pix_fmt = config.pix_fmt
@@ -207,4 +214,6 @@ def try_encoder(config: VideoConfig, size: tuple[int, int], fps: float) -> None:
         _encode(encoder, None)
     except (av.FFmpegError, ValueError) as error:
         expected = f"expected even sizes and settings of {config.vcodec}"
-        raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {config}: {error}; {expected}") from error
+        raise UsageError(
+            f"cannot encode {size[1]} x {size[0]} pictures with {config}: {error}; {expected}"
+        ) from error
