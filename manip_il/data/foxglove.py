@@ -147,6 +147,7 @@ def read_images(stream: BinaryIO, cameras: Collection[str]) -> dict[str, U8]:
     """Return the pictures that `images` wrote to a file, (T, height, width, 3), by camera."""
     pictures: dict[str, list[U8]] = {camera: [] for camera in cameras}
     topics = [IMAGE_TOPICS + camera for camera in cameras]
+    stream.seek(0)
     for _, channel, message in make_reader(stream).iter_messages(topics) if cameras else ():
         image = RawImage.FromString(message.data)
         picture = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)

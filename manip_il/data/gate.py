@@ -29,6 +29,7 @@ _PLAIN = (
     *("Value", "ClassLabel", "List", "LargeList", "Sequence", "Json"),
     *("Array2D", "Array3D", "Array4D", "Array5D"),
 )
+_ARRAY = re.compile(rb"datasets\.features\.features\.Array[2-5]DExtensionType")
 _TYPE = re.compile(r'"_type": "?([^",}\]]*)')  # in the JSON from which `datasets` makes a feature
 _BATCH = 64  # rows in memory at once
 
@@ -91,7 +92,7 @@ def _check_columns(schema: pa.Schema, pictures: Collection[str], structs: Collec
         structs: The columns that may hold structs.
     """
     for column in schema:
-        if column.name not in structs and not _is_plain(column.type):
+        if not _is_plain(column, column.name in structs):
             raise ValueError(f"column {column.name!r} holds {column.type}; expected plain values")
     about = checks.parse_json("its metadata", (schema.metadata or {}).get(b"huggingface", b"{}"))
     for key, feature in about.get("info", {}).get("features", {}).items():
@@ -102,13 +103,16 @@ def _check_columns(schema: pa.Schema, pictures: Collection[str], structs: Collec
             )
 
 
-def _is_plain(kind: pa.DataType) -> bool:
-    """Return whether a type consists of plain values and lists, without structs, which a map holds, too."""
-    if isinstance(kind, pa.BaseExtensionType):
-        kind = kind.storage_type
-    if pa.types.is_struct(kind):
+def _is_plain(column: pa.Field, structs: bool) -> bool:
+    """Return whether a column's type consists of plain values, lists and, if they are allowed, structs."""
+    kind, extension = column.type, (column.metadata or {}).get(b"ARROW:extension:name")
+    if extension is not None and not _ARRAY.fullmatch(extension):
         return False
-    return all(_is_plain(kind.field(place).type) for place in range(kind.num_fields))
+    if pa.types.is_struct(kind) and not structs:  # a map holds structs
+        return False
+    if isinstance(kind, pa.BaseExtensionType):
+        return kind == pa.json_()
+    return all(_is_plain(kind.field(place), structs) for place in range(kind.num_fields))
 
 
 def _check_cells(camera: Feature, cells: pa.Array, first: int) -> None:
