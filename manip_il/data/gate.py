@@ -95,7 +95,7 @@ def _check_columns(schema: pa.Schema, pictures: Collection[str], structs: Collec
         if not _is_plain(column, column.name in structs):
             raise ValueError(f"column {column.name!r} holds {column.type}; expected plain values")
     about = checks.parse_json("its metadata", (schema.metadata or {}).get(b"huggingface", b"{}"))
-    for key, feature in about.get("info", {}).get("features", {}).items():
+    for key, feature in (about.get("info", {}).get("features") or {}).items():
         allowed = (*_PLAIN, "Image") if key in pictures else _PLAIN
         if not {*_TYPE.findall(json.dumps(feature))} <= {*allowed}:
             raise ValueError(
