@@ -148,7 +148,10 @@ def read_images(stream: BinaryIO, cameras: Collection[str]) -> dict[str, U8]:
     pictures: dict[str, list[U8]] = {camera: [] for camera in cameras}
     topics = [IMAGE_TOPICS + camera for camera in cameras]
     stream.seek(0)
-    for _, channel, message in make_reader(stream).iter_messages(topics) if cameras else ():
+    if not cameras:
+        return {}
+    messages = make_reader(stream).iter_messages(topics, log_time_order=False)  # as written
+    for _, channel, message in messages:
         image = RawImage.FromString(message.data)
         picture = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
         pictures[channel.topic.removeprefix(IMAGE_TOPICS)].append(picture)
