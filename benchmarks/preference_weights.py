@@ -19,6 +19,7 @@ import argparse
 import json
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +30,9 @@ from manip_il.chapter.preferences.pairs import choose_pairs, find_datasets
 from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.main import main as manip_il
 from manip_il.data import schema
-from manip_il.data.build import merge_datasets, rewrite_columns
-from manip_il.data.dataset import Dataset, Own, StoredEpisode
+from manip_il.data.build import merge_datasets
+from manip_il.data.dataset import Dataset, EpisodeData, Own
+from manip_il.data.lerobot_write import write_episodes
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import EvalResult
@@ -129,16 +131,18 @@ def join(good: Path, bad: Path, target: Path) -> None:
     datasets, made = [*map(Dataset.open, (good, bad))], [target.with_name(name) for name in ("half_good", "half_bad")]
     for dataset, part in zip(datasets, made, strict=True):
         own = Own(dataset.spec, dataset.fingerprint, dataset.provenance)
-        rewrite_columns(dataset, part, map(as_recorded, dataset.stored_episodes()), own, dataset.stored_features)
+        episodes = map(as_recorded, dataset.stored_episodes())
+        write_episodes(episodes, part, dataset.stored_features, dataset.fps, dataset.info.robot, own)
     first, second = (dataset.info.episodes for dataset in datasets)
     count = min(first, second)
     merge_datasets(made, target, [f"0:{count}", f"{first}:{first + count}"])
 
 
-def as_recorded(episode: StoredEpisode) -> dict[str, np.ndarray]:
-    """Return the executed actions as labels."""
+def as_recorded(episode: EpisodeData) -> EpisodeData:
+    """Return an episode with the executed actions as labels."""
     action = episode.columns[schema.EXECUTED_ACTION]
-    return {schema.ACTION: action, schema.LABEL_VALID: np.ones(len(action), np.int64)}
+    labels = {schema.ACTION: action, schema.LABEL_VALID: np.ones(len(action), np.int64)}
+    return replace(episode, columns={**episode.columns, **labels})
 
 
 def run(line: str, output: Path) -> None:

@@ -21,13 +21,13 @@ from manip_il.collect.environments import env_actions, env_fingerprint, env_spec
 from manip_il.collect.scenes import CHUNK, SceneDrawer, Scenes
 from manip_il.collect.workers import map_in_order
 from manip_il.data import schema
-from manip_il.data.build import dataset_sha256, rewrite_columns
-from manip_il.data.dataset import UNKNOWN_TASK, Dataset, Own
+from manip_il.data.build import dataset_sha256
+from manip_il.data.dataset import UNKNOWN_TASK, Dataset, EpisodeData, Own
 from manip_il.data.episodes import to_episode
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.info import Info
 from manip_il.data.lerobot_layout import OURS, Features
-from manip_il.data.lerobot_write import write_dataset
+from manip_il.data.lerobot_write import write_dataset, write_episodes
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
 from manip_il.mdp import F64, Episode, State
@@ -106,7 +106,7 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
 
     States in which the expert was not queried get a label, too. Returns the number of frames whose label changed: its
     action by more than `NOTICEABLE`, its phase, or its validity. Raises what `Dataset.stored_episodes` and
-    `rewrite_columns` raise, and `ManipError` if a worker dies.
+    `write_episodes` raise, and `ManipError` if a worker dies.
     """
     source.check_has_no_sag("data relabel")
     scale, dataset = env_actions(source.env).scale, source.dataset
@@ -121,7 +121,7 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
 def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget) -> Info:
     """Write `source` with the pictures of these cameras instead of its own; all other columns stay the same.
 
-    Raises `RenderError` if there is no OpenGL, and what `Dataset.stored_episodes` and `rewrite_columns` raise.
+    Raises `RenderError` if there is no OpenGL, and what `Dataset.stored_episodes` and `write_episodes` raise.
     """
     dataset, here = source.dataset, env_spec(source.env, cameras)
     spec = replace(dataset.spec, cameras=here.cameras, image_size=here.image_size, keypoints=here.keypoints)
@@ -163,16 +163,19 @@ def _rewrite(
     source: EditSource, target: EditTarget, work: Callable[[NDArray[Any]], Columns], own: Own, features: Features
 ) -> Info:
     """Write `source` with the columns that workers make from each episode's states, (T, m). features: of the target."""
+    dataset = source.dataset
 
-    def columns() -> Iterator[Columns]:
-        for _, found in made:
+    def episodes() -> Iterator[EpisodeData]:
+        for one, (_, found) in zip(dataset.stored_episodes(), made, strict=True):
             target.on_piece()
-            yield found
+            yield replace(one, columns={**one.columns, **found})
 
-    episodes = source.dataset.stored_episodes([schema.SIM_STATE])
-    states = (np.asarray(one.columns[schema.SIM_STATE]) for one in episodes)
+    states = (np.asarray(one.columns[schema.SIM_STATE]) for one in dataset.stored_episodes([schema.SIM_STATE]))
+    about = dataset.fps, dataset.info.robot, own
     with closing(map_in_order(work, states, target.workers)) as made:
-        return rewrite_columns(source.dataset, target.root, columns(), own, features, replace=target.replace)
+        return write_episodes(
+            episodes(), target.root, features, *about, tables=dataset.other_tables, replace=target.replace
+        )
 
 
 def _write[T](

@@ -3,12 +3,13 @@
 `schema.py` lists the columns; its `RobotTaskSpec` holds the names, sizes and rate that a dataset, a policy and an
 environment must share. `episodes.py` turns transitions into an `Episode` with these columns.
 
-`journal.py` writes a journal, one MCAP file, as soon as an episode ends. `lerobot_write.py` writes datasets episode by
-episode with pyarrow and PyAV. `build.py` makes a dataset from rollouts (as they arrive, or from a folder of journals),
-merges datasets, or replaces columns of one. `dataset.py` opens any LeRobot dataset: `info.py` and `parquet_files.py`
-parse its `meta/` and columns, `camera.py` finds and decodes its pictures, `statistics.py` computes and reads
-statistics. `lerobot_layout.py` has LeRobot's paths and Arrow types, `joined.py` presents several datasets as one,
-`video.py` writes videos. `gate.py` opens untrusted files in a child process.
+`journal.py` writes a journal, one MCAP file, as soon as an episode ends. `lerobot_write.py` writes datasets
+episode by episode with pyarrow and PyAV: every dataset, whether recorded, built, merged, edited or imported, is one
+call of `write_episodes` with other `EpisodeData`. `build.py` selects episodes of rollouts (as they arrive, or from
+a folder of journals) and merges datasets. `dataset.py` opens any LeRobot dataset: `info.py` and `parquet_files.py`
+parse its `meta/` and columns, `camera.py` decodes its pictures, `statistics.py` computes and reads statistics.
+`lerobot_layout.py` has LeRobot's paths and Arrow types, `joined.py` presents several datasets as one, `video.py`
+writes videos. `gate.py` opens untrusted files in a child process.
 
 Guarantees:
 

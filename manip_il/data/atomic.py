@@ -25,9 +25,8 @@ def writing(path: Path) -> Generator[None]:
     """Raise `ManipError` if the disk is full or read-only. It names the file that failed, or `path` if unknown."""
     try:
         yield
-    except (
-        Exception
-    ) as error:  # errors of Arrow and FFmpeg are OSErrors, too; those of safetensors only name the number
+    except Exception as error:
+        # errors of Arrow and FFmpeg are OSErrors, too; those of safetensors only name the number
         named = re.search(r"os error (\d+)", str(error))
         number = getattr(error, "errno", None) or (int(named[1]) if named else None)
         if number not in _WRITE_ERRORS:
@@ -63,7 +62,8 @@ def new_folder(root: Path, *, replaces: str = "") -> Generator[Path]:
             _libc("syncfs", handle)  # one call for all files
             require_replaceable(root, replaces)
             if replaces and root.exists():
-                here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE: `root` exists at every moment
+                # AT_FDCWD and RENAME_EXCHANGE: `root` exists at every moment
+                here, exchange = -100, 2
                 _libc("renameat2", here, os.fsencode(new), here, os.fsencode(root), exchange)
             else:
                 new.rename(root)
@@ -83,10 +83,13 @@ def exclusive(folder: Path) -> Generator[int]:
         folder.mkdir(parents=True, exist_ok=True)
     handle = os.open(folder, os.O_RDONLY)
     try:
-        if not _try_lock(handle):
-            raise ManipError(
-                f"{folder} is in use by another process; wait until that is done, or choose another folder"
-            )
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            text = f"{folder} is in use by another process; wait until that is done, or choose another folder"
+            raise ManipError(text) from error
+        except OSError:  # a cluster's file system may not support locks
+            pass
         try:
             yield handle
         finally:
@@ -137,16 +140,6 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _try_lock(handle: int) -> bool:
-    """Lock an open file or folder until it is closed; return False if another process holds it."""
-    with contextlib.suppress(OSError):  # a cluster's file system may not support locks
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-    return True
 
 
 def _libc(name: str, *arguments: int | bytes) -> None:

@@ -1,4 +1,4 @@
-"""Make datasets: from rollouts or journals, by merging datasets, or by replacing columns of one."""
+"""Make datasets: from rollouts or journals, or by merging datasets."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import itertools
 import logging
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,12 +17,12 @@ import numpy as np
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import write_json
-from manip_il.data.dataset import UNKNOWN_TASK, Dataset, Own
+from manip_il.data.dataset import Dataset, EpisodeData, Own
 from manip_il.data.episodes import parts
 from manip_il.data.fingerprint import compare_fingerprints, file_sha256
-from manip_il.data.info import PICTURES, Info, read_info, reading
+from manip_il.data.info import PICTURES, Info, reading
 from manip_il.data.journal import Journal, list_episodes, read_journal
-from manip_il.data.lerobot_write import Columns, new_dataset, write_dataset
+from manip_il.data.lerobot_write import write_dataset, write_episodes
 from manip_il.data.schema import IMAGES, LABEL_VALID, check_same_spec
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError, UnknownName, UsageError
@@ -69,62 +70,74 @@ class Recording:
     def make(self, rollouts: Rollouts, root: Path, *, replace: bool = False) -> tuple[Info, int]:
         """Write rollouts as a dataset; return its info and the number of failed episodes left out.
 
-        rollouts: in seed order; all are consumed, even after a limit is reached. Spec and fingerprint are the first
-        rollout's; if another fingerprint differs, a warning is logged. The selection depends on the rollouts alone, so
-        that recording directly and building later give the same bytes. Raises what `write_dataset` raises,
-        `MismatchError` for a rollout of another robot, task or cameras, `NothingToLearnError` if there is no episode.
+        Spec and fingerprint are the first rollout's; if another fingerprint differs, a warning is logged. The selection
+        depends on the rollouts alone, so that recording directly and building later give the same bytes.
+
+        Args:
+            rollouts: In seed order; all are consumed, even after a limit is reached.
+            root: The new folder.
+            replace: As in `new_folder`.
+
+        Raises:
+            MismatchError: A rollout has another robot, task or cameras.
+            NothingToLearnError: There is no episode.
+            FolderExistsError, ManipError: As in `write_dataset`.
         """
         rollouts = iter(rollouts)
         if (first := next(rollouts, None)) is None:
             raise NothingToLearnError("no episode was recorded")
         about = first[0]
-        seeds = list[int]()
-        failed = 0
-        found = 0
         provenance = dict(self.provenance)
+        failed: list[int] = []  # seeds
 
         def selected() -> Iterator[Episode]:
-            nonlocal failed, found
-            labels = 0
+            episodes = math.inf if self.episodes is None else self.episodes  # still to be kept
+            labels = math.inf if self.labels is None else self.labels
+            seeds: list[int] = []
+            empty = True
             for journal, rollout in itertools.chain([first], rollouts):
-                name = f"the journal of seed {rollout.seed}"
-                if journal.spec != about.spec:
-                    raise MismatchError(
-                        "spec (robot, task or cameras)", name, journal.spec, "the first journal", about.spec
-                    )
-                for line in compare_fingerprints(name, journal.fingerprint, "the first journal", about.fingerprint):
-                    _LOG.warning("%s", line)
-                if self._is_full(found, labels):
-                    continue
-                seeds.append(rollout.seed)
+                _compare(journal, f"the journal of seed {rollout.seed}", about)
+                if min(episodes, labels) > 0:
+                    seeds.append(rollout.seed)
                 for part in parts(rollout):
-                    if self._is_full(found, labels):
+                    if min(episodes, labels) <= 0:
                         break
                     if self.only_successes and not part.success:
-                        failed += 1
+                        failed.append(rollout.seed)
                         continue
                     if self.labels is not None:
-                        part = _first_labels(part, self.labels - labels)
+                        part = _first_labels(part, labels)
                     own = int(part.columns[LABEL_VALID].sum()) if LABEL_VALID in part.columns else 0
                     if own or not self.only_labelled:
                         yield part
-                        found, labels = found + 1, labels + own
-            if not found:
+                        empty = False
+                        episodes -= 1
+                        labels -= own
+            if empty:
                 raise NothingToLearnError(
                     "no episode has labels to learn from: the expert was never queried or gave no valid label"
                 )
             provenance.update(seeds=[seeds[0], seeds[-1]], tried=len(seeds))
 
         video = VideoConfig(**self.video)
-        options: dict[str, Any] = {"fingerprint": about.fingerprint, "video": video}
-        return write_dataset(selected(), root, about.spec, provenance, replace=replace, **options), failed
+        options: dict[str, Any] = {
+            "fingerprint": about.fingerprint,
+            "video": video,
+            "replace": replace,
+        }
+        return write_dataset(selected(), root, about.spec, provenance, **options), len(failed)
 
-    def _is_full(self, episodes: int, labels: int) -> bool:
-        limits = (self.episodes, episodes), (self.labels, labels)
-        return any(most is not None and found >= most for most, found in limits)
+
+def _compare(journal: Journal, name: str, about: Journal) -> None:
+    """Raise `MismatchError` for another spec than the first journal's, and warn of another fingerprint."""
+    first = "the first journal"
+    if journal.spec != about.spec:
+        raise MismatchError("spec (robot, task or cameras)", name, journal.spec, first, about.spec)
+    for line in compare_fingerprints(name, journal.fingerprint, first, about.fingerprint):
+        _LOG.warning("%s", line)
 
 
-def _first_labels(episode: Episode, most: int) -> Episode:
+def _first_labels(episode: Episode, most: float) -> Episode:
     """Return the episode with `label_valid` 0 after its first `most` valid labels."""
     valid = episode.columns[LABEL_VALID].astype(np.int64)
     kept = valid * (np.cumsum(valid).reshape(valid.shape) <= most)
@@ -184,17 +197,18 @@ def merge_datasets(
         for key, feature in table.items():
             if features.setdefault(key, feature)["dtype"] == "image":  # encoded if others have films
                 features[key] = feature
-    about = opened[0].fps, opened[0].info.robot or None, own
-    before, tables = 0, opened[0].other_tables
-    with new_dataset(root, features, *about, tables=tables, replace=replace) as writer:
+
+    def chosen() -> Iterator[EpisodeData]:
+        before = 0
         for dataset in opened:
-            chosen = {*range(before, before + dataset.info.episodes)} & kept
+            cut = not kept.issuperset(range(before, before + dataset.info.episodes))
             for one in dataset.stored_episodes(renamed=names):
-                if before + one.number in chosen:
-                    cut = len(chosen) < dataset.info.episodes
-                    writer.add_columns(one.columns, one.tasks, one.others, one, cut=cut)
+                if before + one.number in kept:
+                    yield dataclasses.replace(one, cut=cut)
             before += dataset.info.episodes
-    return read_info(root)
+
+    about = opened[0].fps, opened[0].info.robot, own
+    return write_episodes(chosen(), root, features, *about, tables=opened[0].other_tables, replace=replace)
 
 
 def choose_episodes(words: Sequence[str], count: int) -> set[int]:
@@ -212,42 +226,15 @@ def choose_episodes(words: Sequence[str], count: int) -> set[int]:
     return chosen
 
 
-def rewrite_columns(
-    dataset: Dataset,
-    target: Path,
-    columns: Iterable[Columns],
-    own: Own,
-    features: layout.Features,
-    *,
-    replace: bool = False,
-) -> Info:
-    """Write a dataset to `target` with some columns replaced; all other columns, texts and films stay the same.
-
-    Args:
-        dataset: The source.
-        target: The new folder.
-        columns: For every episode in stored order, name -> (T,) or (T, d), or pictures (T, height, width, 3).
-        own: The new dataset's description.
-        features: Its columns; those that `columns` lack are the source's.
-        replace: As in `new_folder`.
-    """
-    about = dataset.fps, dataset.info.robot or None, own
-    with new_dataset(target, features, *about, tables=dataset.other_tables, replace=replace) as writer:
-        for one, fresh in zip(dataset.stored_episodes(), columns, strict=True):
-            writer.add_columns({**one.columns, **fresh}, one.tasks, one.others, one)
-    return read_info(target)
-
-
 def _merged_description(
     opened: Sequence[Dataset], names: Mapping[str, str], provenance: Mapping[str, Any]
 ) -> Own | None:
     """Return the content of `meta/manip_il.json` for merged datasets; None if no dataset is ours."""
-    if not any(one.own for one in opened):
+    if (about := next((one for one in opened if one.own), None)) is None:
         return None
-    about = next((one for one in opened if one.spec.task != UNKNOWN_TASK), opened[0])
     own = opened[0].fingerprint
     for one in opened:
-        also = ("sim_state_size", "image_size", *(("task",) if one.spec.task != UNKNOWN_TASK else ()))
+        also = ("sim_state_size", "image_size", *(("task",) if one.own else ()))
         check_same_spec(str(about.root), about.spec, str(one.root), one.spec, also)
         for warning in compare_fingerprints(str(opened[0].root), own, str(one.root), one.fingerprint):
             _LOG.warning("%s", warning)
@@ -275,7 +262,8 @@ def _check_same_facts(left: Dataset, right: Dataset, names: Mapping[str, str]) -
     ours, theirs = _facts(left, names), _facts(right, names)
     for what in {**ours, **theirs}:
         one, other = ours.get(what, "none"), theirs.get(what, "none")
-        is_unknown = what.startswith("film ") and "none" in (one, other)  # no film, or not described as fully
+        # no film, or not described as fully
+        is_unknown = what.startswith("film ") and "none" in (one, other)
         if one != other and not is_unknown:
             raise MismatchError(what, str(left.root), one, str(right.root), other)
 

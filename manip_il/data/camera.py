@@ -28,9 +28,8 @@ from PIL import Image
 
 from manip_il import checks
 from manip_il.data.atomic import writing
-from manip_il.data.info import PICTURES, Info, reading
-from manip_il.data.parquet_files import EpisodeTable, count_rows, read_file
-from manip_il.errors import ManipError, UnknownName
+from manip_il.data.info import reading
+from manip_il.data.parquet_files import read_file
 from manip_il.mdp import I64
 
 Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
@@ -42,7 +41,6 @@ _OPTIONS = {
     "protocol_whitelist": "file",
     "enable_drefs": "0",  # no tracks in other files
 }
-_BLOCK = 128  # largest block of pixels by which decoders enlarge pictures
 _OPEN_FILMS, _OPEN_TABLES = 32, 4  # video and data files that one process keeps open
 
 
@@ -50,7 +48,7 @@ _OPEN_FILMS, _OPEN_TABLES = 32, 4  # video and data files that one process keeps
 class FrameRange:
     """Frames `first` to `first + count - 1` of a file: the dataset's rows `row` to `row + count - 1`."""
 
-    path: str
+    path: Path
     first: int
     count: int
     row: int
@@ -58,38 +56,22 @@ class FrameRange:
 
 @dataclass(frozen=True)
 class Camera:
-    """Pictures of one camera. size: height and width [pixels]. parts: ranges that hold every row once, in order.
+    """Pictures of one camera.
 
-    films: whether pictures are in video files; otherwise they are cells of the data files.
+    key: its column. fps: [Hz]. size: height and width [pixels]. films: whether pictures are in video files; otherwise
+    they are cells of the data files. parts: ranges that hold every row once, in order.
     """
 
-    root: Path
     key: str
     fps: float
-    frames: int
     size: tuple[int, int]
     films: bool
     parts: tuple[FrameRange, ...]
 
-    @classmethod
-    def of(cls, root: Path, info: Info, episodes: EpisodeTable, data_files: Sequence[Path], key: str) -> Camera:
-        """Find a camera's pictures without decoding them.
-
-        Raises `UnknownName` for a column that is not a camera, and `ManipError` for depth maps or if the dataset's
-        files do not hold each frame exactly once.
-        """
-        cameras = {feature.key: feature for feature in info.of_dtype(*PICTURES)}
-        if key not in cameras:
-            raise UnknownName(f"camera in {root}", key, cameras)
-        feature = cameras[key]
-        if not feature.is_rgb:
-            raise ManipError(f"{key} of {root} has shape {feature.shape}; expected RGB pictures")
-        films = feature.dtype == "video"
-        parts = _film_parts(episodes, info, key) if films else _table_parts(root, data_files)
-        ends = [part.row + part.count for part in parts]
-        if [0, *ends[:-1]] != [part.row for part in parts] or ends[-1:] != [info.frames]:
-            raise ManipError(f"{root}: the files of {key} do not hold each of the {info.frames} frames exactly once")
-        return cls(root, key, info.fps, info.frames, feature.picture_size, films, tuple(parts))
+    @property
+    def frames(self) -> int:
+        """Number of pictures."""
+        return sum(part.count for part in self.parts)
 
     def rows(self, rows: I64) -> Pictures:
         """Return the decoded pictures, (B, height, width, 3), of these rows, (B,).
@@ -101,18 +83,18 @@ class Camera:
         which = np.searchsorted(starts, wanted, side="right") - 1
         cuts = np.flatnonzero((np.diff(wanted) != 1) | (np.diff(which) != 0)) + 1
         found = [self._read(self.parts[which[at[0]]], wanted[at]) for at in np.split(np.arange(len(wanted)), cuts)]
-        return np.concatenate(found)[places.reshape(-1)] if len(rows) else np.empty((0, *self.size, 3), np.uint8)
+        return np.concatenate(found)[places.reshape(-1)]
 
     def _read(self, part: FrameRange, rows: I64) -> Pictures:
         """Return the pictures of consecutive rows of one part."""
-        path, first = self.root / part.path, part.first + int(rows[0]) - part.row
-        with reading(path):
-            changed = path.stat().st_mtime_ns
+        first = part.first + int(rows[0]) - part.row
+        with reading(part.path):
+            changed = part.path.stat().st_mtime_ns
             if self.films:
-                film = _film(path, changed, threading.get_ident(), self.size)
+                film = _film(part.path, changed, threading.get_ident(), self.size)
                 pictures = read_frames(film, first, len(rows), self.fps)
             else:
-                cells = _table(path, changed, self.key)[first : first + len(rows)]
+                cells = _table(part.path, changed, self.key)[first : first + len(rows)]
                 # a cell's `path` is never followed
                 contents = [(cell or {}).get("bytes") for cell in cells.to_pylist()]
                 pictures = np.stack([decode_picture(content, self.size) for content in contents])
@@ -128,22 +110,24 @@ def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = 
     """
     shape = sum(camera.frames for camera in cameras), 3, *cameras[0].size
     with writing(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
-        os.posix_fallocate(file.fileno(), 0, math.prod(shape))  # otherwise a full disk kills the process
+        # otherwise a full disk kills the process
+        os.posix_fallocate(file.fileno(), 0, math.prod(shape))
         decoded = np.memmap(file, np.uint8, "r+", shape=shape)
+    step = max(_PIECE, _PIECE_BYTES // math.prod(shape[1:]))
+    pieces = list[tuple[Camera, I64, NDArray[np.uint8]]]()  # camera, rows, place of their pictures
+    start = 0
+    for camera in cameras:
+        for rows in np.split(np.arange(camera.frames), range(step, camera.frames, step)):
+            pieces.append((camera, rows, decoded[start : start + len(rows)]))
+            start += len(rows)
 
-    def fill(camera: Camera, start: int, rows: I64) -> int:
-        decoded[start + rows[0] : start + rows[-1] + 1] = camera.rows(rows).transpose(0, 3, 1, 2)
+    def fill(piece: tuple[Camera, I64, NDArray[np.uint8]]) -> int:
+        camera, rows, place = piece
+        place[:] = camera.rows(rows).transpose(0, 3, 1, 2)
         return len(rows)
 
-    step = max(_PIECE, _PIECE_BYTES // math.prod(shape[1:]))
-    start = 0
-    pieces = list[tuple[Camera, int, I64]]()
-    for camera in cameras:
-        rows = np.split(np.arange(camera.frames), range(step, camera.frames, step))
-        pieces += [(camera, start, piece) for piece in rows]
-        start += camera.frames
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
-        for count in threads.map(fill, *zip(*pieces, strict=True)):
+        for count in threads.map(fill, pieces):
             if on_frames is not None:
                 on_frames(count)
     return decoded
@@ -200,9 +184,6 @@ def open_video(path: Path, size: tuple[int, int] | None = None) -> InputContaine
         container = av.open(f"file:{opened}", format="mp4", options=_OPTIONS)
     for stream in container.streams.video:
         check_size((stream.height, stream.width), size)
-        # sizes may also change within the stream
-        most = (stream.height + _BLOCK) * (stream.width + _BLOCK)
-        stream.codec_context.options = {"max_pixels": str(most)}
     return container
 
 
@@ -213,12 +194,13 @@ def read_frames(container: InputContainer, first: int, count: int, fps: float) -
     """
     stream = container.streams.video[0]
     tick = stream.time_base or 1  # [s]
-    container.seek(round(first / fps / tick), stream=stream)  # to the last key frame at or before it
-    pictures: list[NDArray[np.uint8]] = []
+    # to the last key frame at or before it
+    container.seek(round(first / fps / tick), stream=stream)
+    pictures: list[Any] = []
     for frame in itertools.islice(container.decode(stream), first + count):  # bounded even if the file is malicious
         ahead = round((frame.pts or 0) * tick * fps) - first - len(pictures)
         if ahead == 0:
-            pictures.append(frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False))
+            pictures.append(frame.to_ndarray(format="rgb24"))
         if ahead > 0 or len(pictures) == count:
             break
     if len(pictures) != count:
@@ -236,20 +218,3 @@ def _film(path: Path, changed: int, thread: int, size: tuple[int, int]) -> Input
 def _table(path: Path, changed: int, key: str) -> Any:
     """Return a data file's column of pictures, not decoded."""
     return read_file(path, [key]).column(key)
-
-
-def _film_parts(episodes: EpisodeTable, info: Info, key: str) -> list[FrameRange]:
-    clips = episodes.clips[key]
-    firsts = np.round(clips.starts * info.fps).astype(np.int64)
-    rows = zip(clips.files, firsts.tolist(), episodes.length.tolist(), episodes.start.tolist(), strict=True)
-    return sorted((FrameRange(*row) for row in rows if row[2]), key=lambda part: part.row)
-
-
-def _table_parts(root: Path, data_files: Sequence[Path]) -> list[FrameRange]:
-    counts = [count_rows(path) for path in data_files]
-    rows = np.cumsum([0, *counts]).tolist()
-    return [
-        FrameRange(path.relative_to(root).as_posix(), 0, count, row)
-        for path, count, row in zip(data_files, counts, rows, strict=False)
-        if count
-    ]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.camera import Camera
+from manip_il.data.camera import Camera, FrameRange
 from manip_il.data.info import NUMBERS, PICTURES, Feature, Info, read_info, reading
 from manip_il.data.parquet_files import (
     Column,
@@ -48,21 +48,30 @@ class Own:
 
 
 @dataclass(frozen=True)
-class StoredEpisode:
-    """An episode as it is stored.
+class EpisodeData:
+    """An episode that is written to a dataset, or as it is stored in one.
 
-    tasks: the text of every frame. others: values in the columns of `meta/episodes` that LeRobot does not have.
-    columns: those of the data files, (T,) or (T, ...); all but numbers as Arrow arrays. clips: by camera, as from
-    `Dataset.clip`.
+    Its films and statistics of pictures are copied for the cameras that are not among its columns.
+
+    Args:
+        columns: (T,) or (T, ...), pictures (T, height, width, 3); stored text and PNG files are Arrow arrays.
+        tasks: The text of every frame.
+        others: Values in the columns of `meta/episodes` that LeRobot does not have.
+        dataset: Where it is stored.
+        number: Its number there.
+        films: Its frames in the films of each camera there.
+        picture_statistics: Stored statistics of its pictures, by camera.
+        cut: Whether only its part of a film is copied, not the whole file.
     """
 
-    dataset: Dataset
-    number: int
-    tasks: list[str]
-    others: dict[str, Any]
-    columns: dict[str, Column]
-    clips: dict[str, tuple[Path, int, int]]
-    picture_statistics: Statistics
+    columns: Mapping[str, Column]
+    tasks: Sequence[str]
+    others: Mapping[str, Any] = field(default_factory=dict)
+    dataset: Dataset | None = None
+    number: int = 0
+    films: Mapping[str, FrameRange] = field(default_factory=dict)
+    picture_statistics: Statistics = field(default_factory=dict)
+    cut: bool = False
 
 
 class Dataset:
@@ -176,16 +185,22 @@ class Dataset:
             return read_statistics(self.root)
         return column_statistics(self.columns())
 
-    @cached_property
+    @property
     def data_files(self) -> list[Path]:
         """The data files in row order."""
-        paths = sorted(self.root.glob(layout.DATA_FILES))
-        if not paths:
-            raise ManipError(f"{self.root} has no data: no file matches {layout.DATA_FILES}")
-        rows = sum(map(count_rows, paths))
-        if rows != len(self):
+        return [part.path for part in self._cells]
+
+    @cached_property
+    def _cells(self) -> list[FrameRange]:
+        """The rows of each data file."""
+        found: list[FrameRange] = []
+        rows = 0
+        for path in sorted(self.root.glob(layout.DATA_FILES)):
+            found.append(FrameRange(path, 0, count_rows(path), rows))
+            rows += found[-1].count
+        if rows != len(self) or not found:
             raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {rows}")
-        return paths
+        return found
 
     def columns(self, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
         """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors; they may be read-only.
@@ -194,35 +209,49 @@ class Dataset:
         """
         if names is None:
             names = [feature.key for feature in self.info.of_dtype(*NUMBERS)]
-        pieces: list[dict[str, NDArray[Any]]] = []
         known = [key for key, feature in self.features.items() if feature.dtype not in PICTURES]
         for name in names:
             if name not in known:
                 raise UnknownName(f"column in {self.root}", name, known)
-        for path in self.data_files:
-            with reading(path):
-                table = read_file(path, names)
-                pieces.append({name: to_numpy(table.column(name), self.features[name]) for name in names})
+        pieces = [self._read(path, names) for path in self.data_files]
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
+    def _read(self, path: Path, names: Sequence[str]) -> dict[str, Column]:
+        """Read columns of a data file: numbers as numpy arrays, others as Arrow arrays."""
+        with reading(path):
+            table = read_file(path, names)
+            return {name: to_numpy(table.column(name), self.features[name]) for name in names}
+
     def camera(self, key: str) -> Camera:
-        """Return a camera's pictures, not yet decoded. Raises what `Camera.of` raises."""
-        return Camera.of(self.root, self.info, self.episodes, self.data_files, key)
+        """Find a camera's pictures without decoding them.
+
+        Raises `UnknownName` for a column that is not a camera, and `ManipError` for depth maps or if the dataset's
+        files do not hold each frame exactly once.
+        """
+        if key not in self.cameras:
+            raise UnknownName(f"camera in {self.root}", key, self.cameras)
+        feature = self.features[key]
+        if not feature.is_rgb:
+            raise ManipError(f"{key} of {self.root} has shape {feature.shape}; expected RGB pictures")
+        films = feature.dtype == "video"
+        found = self._film_ranges(key) if films else self._cells
+        parts = sorted((part for part in found if part.count), key=lambda part: part.row)
+        ends = np.cumsum([0, *(part.count for part in parts)]).tolist()
+        if [*(part.row for part in parts), len(self)] != ends:
+            raise ManipError(f"{self.root}: the files of {key} do not hold each of the {len(self)} frames exactly once")
+        return Camera(key, self.fps, feature.picture_size, films, tuple(parts))
+
+    def _film_ranges(self, key: str) -> list[FrameRange]:
+        """Return where a camera's films hold each episode."""
+        table, clips = self.episodes, self.episodes.clips[key]
+        firsts = np.round(clips.starts * self.fps).astype(np.int64).tolist()
+        paths = (self.root / file for file in clips.files)
+        rows = zip(paths, firsts, table.length.tolist(), table.start.tolist(), strict=True)
+        return [FrameRange(*row) for row in rows]
 
     def frames(self, key: str, rows: I64) -> NDArray[np.uint8]:
         """Return a camera's decoded pictures, (B, height, width, 3), of these rows, (B,)."""
         return self.camera(key).rows(rows)
-
-    def clip(self, key: str, episode: int) -> tuple[Path, int, int]:
-        """Return where a camera's pictures of an episode are: video file, first frame in it, number of frames."""
-        clips, [place] = self.episodes.clips[key], np.flatnonzero(self.episodes.index == episode)
-        first = round(float(clips.starts[place]) * self.fps)
-        return self.root / clips.files[place], first, int(self.episodes.length[place])
-
-    @cached_property
-    def picture_statistics(self) -> list[Statistics]:
-        """Statistics of every episode's pictures, by camera."""
-        return read_picture_statistics(self.root, self.cameras)
 
     def rows_of(self, episode: int) -> I64:
         """Return the rows of an episode, (T,). Raises `UsageError` if it does not exist."""
@@ -232,11 +261,10 @@ class Dataset:
         [place] = np.flatnonzero(table.index == episode)[:1]
         return np.arange(table.start[place], table.start[place] + table.length[place])
 
-    @cached_property
+    @property
     def stored_features(self) -> layout.Features:
         """The features in `info.json`, with everything that it says of them, without LeRobot's index columns."""
-        table = checks.read_json(self.root / layout.INFO, "a dataset's description")["features"]
-        return {key: one for key, one in table.items() if key not in layout.INDEX_DTYPES}
+        return {key: one.table for key, one in self.features.items() if key not in layout.INDEX_DTYPES}
 
     @property
     def other_tables(self) -> list[Path]:
@@ -251,7 +279,7 @@ class Dataset:
 
     def stored_episodes(
         self, names: Sequence[str] | None = None, renamed: Mapping[str, str] | None = None
-    ) -> Iterator[StoredEpisode]:
+    ) -> Iterator[EpisodeData]:
         """Yield the episodes as they are stored, in order; one data file is in memory at a time.
 
         names: columns to read, by default all in data files, except the numbers of rows, episodes and tasks. renamed:
@@ -260,27 +288,24 @@ class Dataset:
         if names is None:
             names = [key for key, one in self.features.items() if one.dtype != "video" and key not in _NUMBERED]
         new = {key: (renamed or {}).get(key, key) for key in self.features}
+        table = self.episodes
+        films = {key: self._film_ranges(key) for key in table.clips}
+        statistics = read_picture_statistics(self.root, self.cameras)
         undrawn = {layout.DRAWN: "{}"} if s.SIM_STATE in self.features else {}
-        for path in self.data_files:
-            with reading(path):
-                rows = read_file(path, [*names, layout.EPISODE_INDEX, layout.TASK_INDEX])
-                index, columns = rows.column(layout.EPISODE_INDEX).to_numpy(), dict[str, Column]()
-                for name in names:
-                    column, feature = rows.column(name), self.features[name]
-                    columns[new[name]] = to_numpy(column, feature) if feature.dtype in NUMBERS else column
-                texts = self.texts(rows.column(layout.TASK_INDEX).to_numpy())
-                for number in np.unique(index).tolist():
-                    start, stop = np.searchsorted(index, [number, number + 1])
-                    [place] = np.flatnonzero(self.episodes.index == number)
-                    yield StoredEpisode(
-                        dataset=self,
-                        number=number,
-                        tasks=texts[start:stop],
-                        others=undrawn | self.episodes.others[place],
-                        columns={name: column[start:stop] for name, column in columns.items()},
-                        clips={new[key]: self.clip(key, number) for key in self.episodes.clips},
-                        picture_statistics={new[key]: one for key, one in self.picture_statistics[place].items()},
-                    )
+        for cells in self._cells:
+            columns = self._read(cells.path, [*names, layout.TASK_INDEX])
+            texts = self.texts(columns.pop(layout.TASK_INDEX))
+            for place in np.flatnonzero((table.start >= cells.row) & (table.start < cells.row + cells.count)):
+                rows = slice(table.start[place] - cells.row, table.stop[place] - cells.row)
+                yield EpisodeData(
+                    columns={new[name]: column[rows] for name, column in columns.items()},
+                    tasks=texts[rows],
+                    others=undrawn | table.others[place],
+                    dataset=self,
+                    number=int(table.index[place]),
+                    films={new[key]: ranges[place] for key, ranges in films.items()},
+                    picture_statistics={new[key]: one for key, one in statistics[place].items()},
+                )
 
     def count_successes(self) -> int:
         """Return how many episodes succeeded at some step; 0 if there is no success column."""
@@ -300,10 +325,11 @@ def joined_columns(datasets: Sequence[Dataset | Path], names: Sequence[str]) -> 
     episodes = frames = 0
     for given in datasets:
         dataset = given if isinstance(given, Dataset) else Dataset.open(given)
-        before = {layout.EPISODE_INDEX: episodes, layout.INDEX: frames}
         columns = dataset.columns(names)
-        columns |= {name: columns[name] + first for name, first in before.items() if name in columns}
+        for name, before in ((layout.EPISODE_INDEX, episodes), (layout.INDEX, frames)):
+            if name in columns:
+                columns[name] = columns[name] + before
         pieces.append(columns)
-        episodes, frames = episodes + dataset.info.episodes, frames + len(dataset)
-    shapes = {name: values.shape[1:] for name, values in pieces[0].items()}
-    return {name: np.concatenate([one[name].reshape(-1, *shape) for one in pieces]) for name, shape in shapes.items()}
+        episodes += dataset.info.episodes
+        frames += len(dataset)
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}

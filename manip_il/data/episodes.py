@@ -28,39 +28,30 @@ def group_rollouts(transitions: Iterable[Transition]) -> Iterator[list[Transitio
 
 
 def to_episode(
-    frames: Sequence[Transition], round_: int = 0, beta: float = 1.0, *, labelled: bool = True, path: int | None = None
+    frames: Sequence[Transition],
+    round_: int = 0,
+    beta: float = 1.0,
+    *,
+    labelled: bool = True,
+    path: int | None = None,
 ) -> Episode:
-    """Return an episode with the schema's columns, (T, 1) or (T, d).
+    """Return an episode with the schema's columns, (T, 1) or (T, d), pictures (T, height, width, 3).
 
-    labelled: include the columns of labels; frames without a label have `label_valid` 0, phase 0, and the executed
-    action as label. path: number of leading frames that decide success; by default all.
+    Args:
+        frames: Of one rollout, in order.
+        round_: Number of the round of DAgger.
+        beta: Probability that the expert drove.
+        labelled: Whether to include the columns of labels; frames without a label have `label_valid` 0, phase 0, and
+            the executed action as label.
+        path: Number of leading frames that decide success; by default all.
     """
-    count = len(frames)
-    columns: dict[str, NDArray[Any]] = {
-        schema.STATE: np.stack([frame.observation.state for frame in frames]),
-        schema.ENVIRONMENT_STATE: np.stack([frame.observation.environment_state for frame in frames]),
-        schema.EXECUTED_ACTION: np.stack([frame.executed_action for frame in frames]).astype(np.float32),
-        schema.ACTOR: _column([frame.actor for frame in frames], np.int64),
-        schema.SIM_STATE: np.stack([frame.state.to_vector() for frame in frames]),
-        schema.PROGRESS: _column([frame.progress for frame in frames], np.float32),
-        schema.REWARD: _column([frame.reward for frame in frames], np.float32),
-        schema.SUCCESS: _column([frame.success for frame in frames], np.bool_),
-        schema.DONE: _column([frame.done for frame in frames], np.bool_),
-        schema.SEED: _column([frame.seed for frame in frames], np.int64),
-        schema.ROUND: _column([round_] * count, np.int64),
-        schema.BETA: _column([beta] * count, np.float32),
-        schema.EXPERT_PHASE: _column([frame.label.phase if frame.label else 0 for frame in frames], np.int64),
-    }
-    for camera in frames[0].observation.images:
-        columns[schema.IMAGES + camera] = np.stack([frame.observation.images[camera] for frame in frames])
-    for camera in frames[0].observation.keypoints:
-        places = np.stack([frame.observation.keypoints[camera] for frame in frames])
-        columns[schema.KEYPOINTS + camera] = places.reshape(count, -1)
-    if labelled:
-        columns[schema.ACTION] = np.stack(
-            [frame.label.action if frame.label else frame.executed_action for frame in frames]
-        ).astype(np.float32)
-        columns[schema.LABEL_VALID] = _column([bool(frame.label and frame.label.valid) for frame in frames], np.int64)
+    rows = [_row(frame, labelled=labelled) | {schema.ROUND: round_, schema.BETA: beta} for frame in frames]
+    columns: dict[str, NDArray[Any]] = {}
+    for key in rows[0]:
+        column = np.array([row[key] for row in rows])
+        if column.dtype == np.float64 and key != schema.SIM_STATE:
+            column = column.astype(np.float32)
+        columns[key] = column if key.startswith(schema.IMAGES) else column.reshape(len(rows), -1)
     decides = frames[:path]
     return Episode(
         seed=frames[0].seed,
@@ -71,18 +62,45 @@ def to_episode(
     )
 
 
+def _row(frame: Transition, *, labelled: bool) -> dict[str, Any]:
+    """Return a frame's values in the columns."""
+    seen, label = frame.observation, frame.label
+    row: dict[str, Any] = {
+        schema.STATE: seen.state,
+        schema.ENVIRONMENT_STATE: seen.environment_state,
+        schema.EXECUTED_ACTION: frame.executed_action,
+        schema.ACTOR: int(frame.actor),
+        schema.SIM_STATE: frame.state.to_vector(),
+        schema.PROGRESS: float(frame.progress),
+        schema.REWARD: float(frame.reward),
+        schema.SUCCESS: bool(frame.success),
+        schema.DONE: bool(frame.done),
+        schema.SEED: frame.seed,
+        schema.EXPERT_PHASE: label.phase if label else 0,
+    }
+    row |= {schema.IMAGES + camera: picture for camera, picture in seen.images.items()}
+    row |= {schema.KEYPOINTS + camera: points for camera, points in seen.keypoints.items()}
+    if labelled:
+        row[schema.ACTION] = label.action if label else frame.executed_action
+        row[schema.LABEL_VALID] = int(bool(label and label.valid))
+    return row
+
+
 def parts(episode: Episode) -> list[Episode]:
     """Split a rollout after every frame with `next.done`; each part is an episode of a dataset."""
     ends = np.flatnonzero(episode.columns[schema.DONE].ravel()) + 1
-    if not len(ends):
-        return [episode]
     found: list[Episode] = []
-    for start, end in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True):
+    start = 0
+    for end in ends.tolist():
         columns = {key: column[start:end] for key, column in episode.columns.items()}
         solved = columns[schema.SUCCESS]
-        found.append(replace(episode, columns=columns, success=bool(solved.any()), success_at_end=bool(solved[-1])))
-    return found
-
-
-def _column(values: list[Any], dtype: type) -> NDArray[Any]:
-    return np.asarray(values, dtype=dtype)[:, None]
+        found.append(
+            replace(
+                episode,
+                columns=columns,
+                success=bool(solved.any()),
+                success_at_end=bool(solved[-1]),
+            )
+        )
+        start = end
+    return found or [episode]

@@ -8,9 +8,9 @@ similarity of successive frames: rendered frames of 128 x 128 took a third of a 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from foxglove_schemas_protobuf.JointState_pb2 import JointState
@@ -19,10 +19,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap.records import Channel as ChannelRecord
-from mcap.records import Chunk
-from mcap.records import Message as MessageRecord
-from mcap.stream_reader import breakup_chunk
+from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 from numpy.typing import NDArray
@@ -36,16 +33,19 @@ Messages = Iterator[Message | str]  # one per frame, all of one class; scalars a
 
 NANOSECONDS = 1_000_000_000
 IMAGE_TOPICS = "/observation/images/"  # prefix of a camera's topic, as in LeRobot
-_JOINT_TOPICS = {"/joint_states": s.STATE, "/action": s.ACTION, "/executed_action": s.EXECUTED_ACTION}
+_JOINT_TOPICS = {
+    "/joint_states": s.STATE,
+    "/action": s.ACTION,
+    "/executed_action": s.EXECUTED_ACTION,
+}
 _SCALARS = (s.ACTOR, s.EXPERT_PHASE, s.LABEL_VALID, s.REWARD, s.SUCCESS, s.DONE)
 
 # copied from LeRobot (`lerobot.utils.foxglove_visualization`)
-_NAMED_NUMBER = {"type": "object", "properties": {"label": {"type": "string"}, "value": {"type": "number"}}}
-SCALARS: dict[str, Any] = {
-    "type": "object",
-    "title": "lerobot.Scalars",
-    "properties": {"scalars": {"type": "array", "items": _NAMED_NUMBER}},
-}
+_SCALARS_NAME = "lerobot.Scalars"
+_SCALARS_SCHEMA = (
+    b'{"type": "object", "title": "lerobot.Scalars", "properties": {"scalars": {"type": "array", "items": '
+    b'{"type": "object", "properties": {"label": {"type": "string"}, "value": {"type": "number"}}}}}}'
+)
 
 
 def frame_times(count: int, rate: Fraction) -> list[int]:
@@ -63,7 +63,9 @@ def joint_states(names: Sequence[str], values: NDArray[Any], times: Times) -> Me
 def scalars(labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Messages:
     """Yield one JSON message of labelled numbers per row. rows: T rows of Python numbers, which must be finite."""
     for row in rows:
-        yield json.dumps({"scalars": [{"label": one, "value": value} for one, value in zip(labels, row, strict=True)]})
+        pairs = zip(labels, row, strict=True)
+        # + for bools
+        yield json.dumps({"scalars": [{"label": label, "value": +value} for label, value in pairs]})
 
 
 def images(frame_id: str, pictures: Iterable[U8], times: Times) -> Messages:
@@ -97,8 +99,8 @@ def episode_channels(episode: Episode, times: Times, joints: Sequence[str]) -> d
     columns = episode.columns
     found = {topic: joint_states(joints, columns[key], times) for topic, key in _JOINT_TOPICS.items() if key in columns}
     if numbers := {key: columns[key].reshape(-1) for key in _SCALARS if key in columns}:
-        lists = [(one.astype(np.int64) if one.dtype.kind == "b" else one).tolist() for one in numbers.values()]
-        found["/scalars"] = scalars(list(numbers), zip(*lists, strict=True))
+        rows = zip(*(column.tolist() for column in numbers.values()), strict=True)
+        found["/scalars"] = scalars(list(numbers), rows)
     for key, pictures in columns.items():
         if key.startswith(s.IMAGES):
             camera = key.removeprefix(s.IMAGES)
@@ -108,37 +110,30 @@ def episode_channels(episode: Episode, times: Times, joints: Sequence[str]) -> d
 
 def add_channels(writer: Writer, channels: Mapping[str, Messages], times: Times) -> None:
     """Write all messages, frame by frame. channels: topic -> messages."""
-    kinds: dict[type, int] = {}  # class of messages -> its schema
+    schemas: dict[type, int] = {}  # class of messages -> its schema
     ids: dict[str, int] = {}
     for frame, (time, messages) in enumerate(zip(times, zip(*channels.values(), strict=True), strict=bool(channels))):
         for topic, message in zip(channels, messages, strict=True):
-            is_text, kind = isinstance(message, str), type(message)
+            kind = type(message)
+            if kind not in schemas:
+                scalars = _SCALARS_NAME, "jsonschema", _SCALARS_SCHEMA
+                schemas[kind] = writer.register_schema(*scalars) if kind is str else register_schema(writer, kind)
             if topic not in ids:
-                if kind not in kinds:
-                    kinds[kind] = _register_scalars(writer) if is_text else register_schema(writer, kind)
-                ids[topic] = writer.register_channel(topic, "json" if is_text else "protobuf", kinds[kind])
+                ids[topic] = writer.register_channel(topic, "json" if kind is str else "protobuf", schemas[kind])
             data = message.encode() if isinstance(message, str) else message.SerializeToString(deterministic=True)
             writer.add_message(ids[topic], time, data, time, frame)
 
 
-def _register_scalars(writer: Writer) -> int:
-    return writer.register_schema(SCALARS["title"], "jsonschema", json.dumps(SCALARS).encode())
-
-
-def read_images(chunks: Iterable[Chunk], shape: tuple[int, ...]) -> dict[str, U8]:
-    """Return the pictures that `images` wrote, by camera; a camera without pictures is left out.
-
-    chunks: all chunks of one file, in order. shape: shape of each camera's pictures, (T, height, width, 3).
-    """
-    pictures: dict[str, U8] = {}
-    cameras: dict[int, str] = {}  # by the id of their channel
-    for record in (record for chunk in chunks for record in breakup_chunk(chunk)):
-        if isinstance(record, ChannelRecord) and record.topic.startswith(IMAGE_TOPICS):
-            cameras[record.id] = record.topic.removeprefix(IMAGE_TOPICS)
-        elif isinstance(record, MessageRecord) and record.channel_id in cameras:
-            camera = cameras[record.channel_id]
-            if camera not in pictures:
-                pictures[camera] = np.empty(shape, np.uint8)
-            data = RawImage.FromString(record.data).data
-            pictures[camera][record.sequence] = np.frombuffer(data, np.uint8).reshape(shape[1:])
-    return pictures
+def read_images(stream: BinaryIO, cameras: Collection[str]) -> dict[str, U8]:
+    """Return the pictures that `images` wrote to a file, (T, height, width, 3), by camera."""
+    pictures: dict[str, list[U8]] = {camera: [] for camera in cameras}
+    topics = [IMAGE_TOPICS + camera for camera in cameras]
+    stream.seek(0)
+    if not cameras:
+        return {}
+    messages = make_reader(stream).iter_messages(topics, log_time_order=False)  # as written
+    for _, channel, message in messages:
+        image = RawImage.FromString(message.data)
+        picture = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
+        pictures[channel.topic.removeprefix(IMAGE_TOPICS)].append(picture)
+    return {camera: np.stack(taken) for camera, taken in pictures.items()}

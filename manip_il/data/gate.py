@@ -7,13 +7,13 @@ in data files, in the columns that `info.json` calls images, and plain values an
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import av
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -25,9 +25,12 @@ from manip_il.data.info import Feature, read_info
 from manip_il.errors import ManipError
 
 _DEPTH = (*FORMATS, "TIFF")  # this program does not decode TIFF
-_PLAIN = ("Value", "ClassLabel", "List", "LargeList", "Sequence", "Json", "Array2D", "Array3D", "Array4D", "Array5D")
+_PLAIN = (
+    *("Value", "ClassLabel", "List", "LargeList", "Sequence", "Json"),
+    *("Array2D", "Array3D", "Array4D", "Array5D"),
+)
 _ARRAY = re.compile(rb"datasets\.features\.features\.Array[2-5]DExtensionType")
-_DAMAGES = (ManipError, OSError, ValueError, pa.ArrowException, av.FFmpegError, Image.DecompressionBombError)
+_TYPE = re.compile(r'"_type": "?([^",}\]]*)')  # in the JSON from which `datasets` makes a feature
 _BATCH = 64  # rows in memory at once
 
 
@@ -47,7 +50,7 @@ def open_files(root: Path) -> None:
         checks.opening(str(path))
         try:
             _open_file(path, path.relative_to(root).parts[0], features)
-        except _DAMAGES as error:
+        except Exception as error:  # libraries raise anything, depending on the file
             reason = getattr(error, "strerror", None) or checks.one_line(error)
             raise ManipError(reason if str(path) in reason else f"{path}: {reason}") from error
 
@@ -92,10 +95,9 @@ def _check_columns(schema: pa.Schema, pictures: Collection[str], structs: Collec
         if not _is_plain(column, column.name in structs):
             raise ValueError(f"column {column.name!r} holds {column.type}; expected plain values")
     about = checks.parse_json("its metadata", (schema.metadata or {}).get(b"huggingface", b"{}"))
-    table = checks.mapping("info in its metadata", checks.mapping("its metadata", about).get("info", {}))
-    for key, feature in checks.mapping("features in its metadata", table.get("features") or {}).items():
+    for key, feature in (about.get("info", {}).get("features") or {}).items():
         allowed = (*_PLAIN, "Image") if key in pictures else _PLAIN
-        if not all(kind in allowed for kind in _decoders(feature)):
+        if not {*_TYPE.findall(json.dumps(feature))} <= {*allowed}:
             raise ValueError(f"column {key!r} is decoded as {checks.shorten(feature)}; expected plain values")
 
 
@@ -111,25 +113,11 @@ def _is_plain(column: pa.Field, structs: bool) -> bool:
     return all(_is_plain(kind.field(place), structs) for place in range(kind.num_fields))
 
 
-def _decoders(feature: Any) -> Iterator[Any]:
-    """Yield every `_type` in the JSON from which `datasets` makes a feature."""
-    if isinstance(feature, dict) and "_type" in feature:
-        yield feature["_type"]
-    parts: Any = feature.values() if isinstance(feature, dict) else feature if isinstance(feature, list) else ()
-    for part in parts:
-        yield from _decoders(part)
-
-
 def _check_cells(camera: Feature, cells: pa.Array, first: int) -> None:
     """Raise `ValueError` unless every cell holds a picture of the camera's size. first: row of the first cell."""
-    kind = cells.type
-    place = kind.get_field_index("bytes") if pa.types.is_struct(kind) else -1
-    if place < 0 or not (pa.types.is_binary(kind[place].type) or pa.types.is_large_binary(kind[place].type)):
-        raise ValueError(f"column {camera.key!r} should hold pictures as bytes; it holds {checks.shorten(str(kind))}")
     contents: Any = pc.struct_field(cells, "bytes")  # pyright: ignore[reportAttributeAccessIssue]
     for row, content in enumerate(contents.to_pylist(), first):
         try:
             open_picture(content, camera.picture_size, FORMATS if camera.is_rgb else _DEPTH)
         except Image.UnidentifiedImageError:
-            what = f"column {camera.key!r} has no PNG or JPEG in row {row:,}"
-            raise ValueError(f"{what}; expected a picture file's bytes") from None
+            raise ValueError(f"column {camera.key!r} has no PNG or JPEG in row {row:,}") from None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,13 +26,22 @@ _MOST = 2**53  # highest accepted number of frames or episodes
 
 @dataclass(frozen=True)
 class Feature:
-    """One column or camera. shape: shape of one frame."""
+    """One column or camera. shape: shape of one frame. table: its whole entry in `info.json`."""
 
     key: str
     dtype: str
     shape: tuple[int, ...]
-    names: Any = None
-    details: dict[str, Any] = field(default_factory=dict)
+    table: dict[str, Any]
+
+    @property
+    def names(self) -> Any:
+        """Names of its values or axes: a list, lists by group, or None."""
+        return self.table.get("names")
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """Further entries, such as a film's codec."""
+        return self.table.get("info") or self.table.get("video_info") or {}
 
     @property
     def size(self) -> int:
@@ -120,6 +129,5 @@ def read_info(root: Path) -> Info:
 
 def _feature(key: str, table: dict[str, Any]) -> Feature:
     checks.name("a feature", key)  # folders and files are named after it
-    details = table.get("info") or table.get("video_info") or {}
     shape = tuple(checks.whole("a size in a shape", size, 0, _MOST) for size in table["shape"])
-    return Feature(key, table["dtype"], shape, table.get("names"), dict(details))
+    return Feature(key, table["dtype"], shape, table)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from functools import reduce
 from typing import Any
@@ -15,7 +16,8 @@ from manip_il.data.lerobot_layout import Features
 from manip_il.data.statistics import Statistics, pool
 from manip_il.mdp import I64
 
-_IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}  # from LeRobot, for every camera
+# from LeRobot, for every camera
+_IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}
 
 
 class JoinedDatasets:
@@ -48,12 +50,10 @@ class JoinedDatasets:
 
         Raises `ManipError` for an index without a text.
         """
-        places, found = {text: place for place, text in enumerate(self.tasks)}, list[I64]()
+        places = {text: place for place, text in enumerate(self.tasks)}
         pieces = np.split(own, np.cumsum([*map(len, self.datasets)])[:-1])
-        for dataset, piece in zip(self.datasets, pieces, strict=True):
-            numbers, which = np.unique(piece, return_inverse=True)
-            found.append(np.array([places[text] for text in dataset.texts(numbers)], np.int64)[which])
-        return np.concatenate(found)
+        texts = [dataset.texts(piece) for dataset, piece in zip(self.datasets, pieces, strict=True)]
+        return np.array([places[text] for text in itertools.chain(*texts)])
 
     def _statistics(self) -> Statistics:
         pooled = reduce(pool, (one.statistics for one in self.datasets))

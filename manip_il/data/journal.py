@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from mcap.records import Attachment, Chunk, DataEnd, Metadata
+from mcap.records import Attachment, DataEnd, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
@@ -119,28 +118,23 @@ def read_journal(path: Path) -> tuple[Journal, Episode]:
 
 def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
     """Read a file and verify its checksums."""
-    texts: Mapping[str, str] = {}
+    values: dict[str, Any] = {}
     columns: dict[str, NDArray[Any]] = {}
-    chunks: list[Chunk] = []
     for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
         if isinstance(record, Metadata) and record.name == _RECORD:
-            texts = record.metadata
+            values = {name: json.loads(text) for name, text in record.metadata.items()}
         elif isinstance(record, Attachment):
             columns[record.name.removesuffix(_NPY)] = np.load(BytesIO(record.data), allow_pickle=False)
-        elif isinstance(record, Chunk):
-            chunks.append(record)
         elif isinstance(record, DataEnd):  # all checksums were verified
             break
-    if (found := texts.get("format")) != _FORMAT:
+    if (found := str(values.pop("format", None))) != _FORMAT:
         raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
-    values: dict[str, Any] = {name: json.loads(text) for name, text in texts.items() if name != "format"}
-    spec, fingerprint = RobotTaskSpec.from_json(values.pop("spec")), values.pop("fingerprint")
-    frames = values.pop("frames")
-    if spec.cameras:  # otherwise the messages are not needed
-        pictures = foxglove.read_images(chunks, (frames, *spec.image_size, 3))
-        columns |= {IMAGES + camera: taken for camera, taken in pictures.items()}
-    # journals of older versions have neither instruction nor draws
-    return Journal(folder, spec, fingerprint), Episode(columns=columns, **values)
+    spec = RobotTaskSpec.from_json(values.pop("spec"))
+    journal = Journal(folder, spec, values.pop("fingerprint"))
+    del values["frames"]
+    pictures = foxglove.read_images(stream, spec.cameras)
+    columns |= {IMAGES + camera: taken for camera, taken in pictures.items()}
+    return journal, Episode(columns=columns, **values)
 
 
 def _to_texts(journal: Journal, episode: Episode) -> dict[str, str]:

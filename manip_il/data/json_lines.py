@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -32,12 +31,8 @@ def append_line(path: Path, record: Record) -> None:
     line = json.dumps(_finite(record), allow_nan=False, default=_plain).encode() + b"\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     with writing(path), open(path, "ab+", opener=checks.without_link) as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(size - 1, 0))
-        if file.read(1) not in (b"", b"\n"):
-            file.seek(0)
-            file.truncate(file.read().rfind(b"\n") + 1)
-        file.seek(0, os.SEEK_END)
+        file.seek(0)
+        file.truncate(file.read().rfind(b"\n") + 1)
         file.write(line)
         file.flush()  # inside `writing`, which reports a full disk
 

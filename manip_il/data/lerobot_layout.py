@@ -36,7 +36,15 @@ DRAWN = "drawn"  # our column in meta/episodes: an episode's random draws, as JS
 
 INDEX_DTYPES = {TIMESTAMP: "float32"} | dict.fromkeys((FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX), "int64")
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})  # a file's content and its original name
+# a file's content and its original name
+PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
+_TASK_IS_INDEX = (  # in pandas' words
+    '{"index_columns": ["task"], "column_indexes": [], "columns": ['
+    '{"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", '
+    '"metadata": null}, '
+    '{"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": null}], '
+    '"pandas_version": "2.3.3"}'
+)
 STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
@@ -46,43 +54,37 @@ def data_schema(features: Features, columns: Mapping[str, Any]) -> pa.Schema:
     Its metadata describes the columns in the form that Hugging Face's package `datasets` reads. columns: those of an
     episode; types that are not LeRobot's for numbers, text or pictures, such as language, are kept.
     """
-    fields: list[pa.Field] = []
+    types: dict[str, pa.DataType] = {}
     hugging_face: dict[str, Any] = {}
     for key, feature in features.items():
-        if feature["dtype"] == "video":  # stored in separate files
+        dtype, shape = feature["dtype"], feature["shape"]
+        if dtype == "video":  # stored in separate files
             continue
-        if feature["dtype"] == "image":
-            fields.append(pa.field(key, PICTURE))
+        if dtype == "image":
+            types[key] = PICTURE
             hugging_face[key] = {"_type": "Image"}
             continue
-        if isinstance(columns[key], pa.ChunkedArray) and feature["dtype"] != "string":
-            fields.append(pa.field(key, columns[key].type))
+        if isinstance(columns[key], pa.ChunkedArray) and dtype != "string":
+            types[key] = columns[key].type
             continue
-        value: dict[str, Any] = {"dtype": feature["dtype"], "_type": "Value"}
-        dtype, shape = pa.type_for_alias(feature["dtype"]), feature["shape"]
+        types[key] = pa.type_for_alias(dtype)
+        hugging_face[key] = {"dtype": dtype, "_type": "Value"}
         if len(shape) > 1:
-            value |= {"shape": list(shape), "_type": f"Array{len(shape)}D"}
+            hugging_face[key] |= {"shape": list(shape), "_type": f"Array{len(shape)}D"}
             for _ in shape:
-                dtype = pa.list_(dtype)
+                types[key] = pa.list_(types[key])
         elif shape != (1,):
-            dtype = pa.list_(dtype, shape[0])
-            value = {"feature": value, "length": shape[0], "_type": "List"}
-        fields.append(pa.field(key, dtype))
-        hugging_face[key] = value
+            types[key] = pa.list_(types[key], shape[0])
+            hugging_face[key] = {"feature": hugging_face[key], "length": shape[0], "_type": "List"}
     metadata = {"huggingface": json.dumps({"info": {"features": hugging_face}})}
-    return pa.schema(fields, metadata=metadata)
+    return pa.schema([*types.items()], metadata=metadata)
 
 
 def tasks_table(instructions: Sequence[str]) -> pa.Table:
     """Return the table of tasks, with `task` as pandas' index, because LeRobot looks tasks up by this index."""
-    columns = [
-        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
-        for name, kind, numpy_type in ((TASK_INDEX, "int64", "int64"), ("task", "unicode", "object"))
-    ]
-    pandas = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.3.3"}
     numbers = pa.array(range(len(instructions)), pa.int64())
     table = pa.table({TASK_INDEX: numbers, "task": pa.array(instructions, pa.string())})
-    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+    return table.replace_schema_metadata({"pandas": _TASK_IS_INDEX})
 
 
 def numbered(template: str, number: int, **names: str) -> tuple[str, int, int]:

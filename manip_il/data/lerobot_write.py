@@ -6,37 +6,43 @@ files in a few milliseconds per episode, and the dataset appears complete or not
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
-from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder
 from manip_il.data.camera import decode_picture
-from manip_il.data.dataset import Own, StoredEpisode
+from manip_il.data.dataset import EpisodeData, Own
 from manip_il.data.info import PICTURES, Info, read_info, reading
 from manip_il.data.ownership import DATASET
 from manip_il.data.parquet_files import Column, ParquetFiles, to_table
-from manip_il.data.schema import RobotTaskSpec, features
-from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, pool, to_lists
+from manip_il.data.schema import RobotTaskSpec, features, plain_rate
+from manip_il.data.statistics import (
+    Statistics,
+    column_statistics,
+    picture_statistics,
+    pool,
+    to_lists,
+)
 from manip_il.data.video import CameraFiles
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError
-from manip_il.mdp import I64, Episode
+from manip_il.mdp import Episode
 
 _GROUP_ROWS = 1_000  # frames per row group
 _GROUP_EPISODES = 100  # episodes per row group of meta/episodes
 _FORMAT = 1  # version of meta/manip_il.json
-Columns = Mapping[str, NDArray[Any]]
 
 
 def write_dataset(
@@ -49,56 +55,68 @@ def write_dataset(
     video: VideoConfig = VideoConfig(),  # noqa: B008  # frozen
     replace: bool = False,
 ) -> Info:
-    """Write the episodes, in order, as a dataset with our columns; return its `info.json`.
+    """Write a dataset with our columns; the same episodes in the same order give the same bytes, videos included.
 
-    The dataset appears when it is complete. Episodes are taken one by one and not kept; the same ones in the same order
-    give the same bytes, videos included. provenance: origin of the episodes, read after the last episode. replace:
-    replace a dataset of ours; otherwise, if `root` is not empty, raises `FolderExistsError` before taking an episode.
-    Also raises `MismatchError` for an episode with other columns than `features(spec)`, and `ManipError` if there are
-    no episodes or the disk is full.
+    Args:
+        episodes: Taken one by one and not kept.
+        root: The new folder, as in `write_episodes`.
+        spec: What the columns mean.
+        provenance: Origin of the episodes, read after the last episode.
+        fingerprint: The environment's.
+        video: Settings of the encoder.
+        replace: As in `write_episodes`.
+
+    Raises:
+        MismatchError: An episode has other columns than `features(spec)`.
+        FolderExistsError, ManipError: As in `write_episodes`.
     """
-    own = Own(spec, fingerprint, {} if provenance is None else provenance)
-    robot, table = spec.robot_type or spec.robot, features(spec)
-    with new_dataset(root, table, spec.fps, robot, own, video=video, replace=replace) as writer:
+    table = features(spec)
+
+    def described() -> Iterator[EpisodeData]:
         for episode in episodes:
             columns = episode.columns
             if table.keys() != columns.keys():
                 raise MismatchError("list of columns", f"seed {episode.seed}", [*columns], "the dataset", [*table])
             text = checks.text("instruction", episode.instruction or spec.instruction)
             drawn = {layout.DRAWN: json.dumps(dict(episode.drawn))}
-            writer.add_columns(columns, [text] * len(episode), drawn)
-    return read_info(root)
+            yield EpisodeData(columns, [text] * len(episode), drawn)
+
+    own = Own(spec, fingerprint, {} if provenance is None else provenance)
+    robot = spec.robot_type or spec.robot
+    return write_episodes(described(), root, table, spec.fps, robot, own, video=video, replace=replace)
 
 
-@contextmanager
-def new_dataset(
+def write_episodes(
+    episodes: Iterable[EpisodeData],
     root: Path,
     features: layout.Features,
     fps: float,
-    robot_type: str | None,
+    robot_type: str,
     own: Own | None = None,
     *,
     video: VideoConfig = VideoConfig(),  # noqa: B008  # frozen
     tables: Iterable[Path] = (),
     replace: bool = False,
-) -> Generator[TableWriter]:
-    """Yield the writer of a dataset, which appears when it is complete.
+) -> Info:
+    """Write a dataset, which appears when it is complete; return its `info.json`.
 
     Args:
+        episodes: Taken one by one and not kept. Films that are not among their columns are copied.
         root: The new folder.
-        features: As in `TableWriter`.
+        features: Columns and cameras, without LeRobot's index columns, which are added.
         fps: Frame rate [Hz].
-        robot_type: LeRobot's name of the robot.
+        robot_type: LeRobot's name of the robot; "" if unknown.
         own: Content of `meta/manip_il.json`, if it is a dataset of ours; read at the end.
         video: Settings of the encoder.
         tables: Other files of `meta/`, to be copied.
         replace: Replace a dataset of ours.
+
+    Raises:
+        FolderExistsError: `root` is not empty, and `replace` is not given; before an episode is taken.
+        ManipError: There are no episodes, or the disk is full.
     """
-    about = features, fps, robot_type, video
-    replaces = DATASET if replace else ""
-    with new_folder(root, replaces=replaces) as folder, closing(TableWriter(folder, *about)) as writer:
-        yield writer
-        writer.close_files()
+    with new_folder(root, replaces=DATASET if replace else "") as folder:
+        _write_tables(episodes, folder, features, fps, robot_type, video)
         for path in tables:
             with checks.native_path(path, "a table") as opened:
                 shutil.copyfile(opened, folder / "meta" / path.name)
@@ -107,162 +125,145 @@ def new_dataset(
             ours = {"format": _FORMAT, "repo_id": name, "spec": own.spec.to_json()}
             ours |= {"fingerprint": dict(own.fingerprint), "provenance": dict(own.provenance)}
             layout.write_json(folder / layout.OURS, ours)
+    return read_info(root)
 
 
-class TableWriter:
-    """Writes a LeRobot dataset with any features into a folder, episode by episode.
+@dataclass
+class _Totals:
+    """What the written episodes have in all. tasks: text -> index, in order of first appearance."""
 
-    features: columns and cameras, without LeRobot's index columns, which are added.
-    """
+    episodes: int = 0
+    frames: int = 0
+    tasks: dict[str, int] = field(default_factory=dict)
+    statistics: Statistics = field(default_factory=dict)
 
-    def __init__(
-        self,
-        folder: Path,
-        features: layout.Features,
-        fps: float,
-        robot_type: str | None,
-        video: VideoConfig = VideoConfig(),  # noqa: B008  # frozen
-    ):
-        index: layout.Features = {
-            key: {"dtype": kind, "shape": (1,), "names": None} for key, kind in layout.INDEX_DTYPES.items()
+
+def _write_tables(
+    episodes: Iterable[EpisodeData],
+    folder: Path,
+    features: layout.Features,
+    fps: float,
+    robot_type: str,
+    video: VideoConfig,
+) -> None:
+    """Write all of LeRobot's files into a folder."""
+    index: layout.Features = {
+        key: {"dtype": kind, "shape": (1,), "names": None} for key, kind in layout.INDEX_DTYPES.items()
+    }
+    features = {key: {**one, "shape": tuple(one["shape"])} for key, one in {**features, **index}.items()}
+    fps = plain_rate(fps)
+    data = ParquetFiles(folder, layout.DATA_PATH, _GROUP_ROWS)
+    meta = ParquetFiles(folder, layout.EPISODES_PATH)
+    films = {key: CameraFiles(folder, key, video, fps) for key, one in features.items() if one["dtype"] == "video"}
+    files = (data, meta, *films.values())
+    totals = _Totals()
+    try:
+        schema: pa.Schema | None = None  # that of the first rows
+        for rows in itertools.batched(_rows(episodes, features, fps, data, films, totals), _GROUP_EPISODES):
+            chunk, file = meta.next_place()
+            place = {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
+            table = pa.Table.from_pylist([row | place for row in rows], schema)
+            schema = table.schema
+            meta.write(table)
+        if not totals.episodes:
+            raise ManipError("there are no episodes to write")
+        for one in files:
+            one.close()
+    finally:
+        for one in files:
+            with suppress(OSError):  # a full disk was already reported
+                one.close()
+    for key, film in films.items():
+        if film.size:
+            features[key].setdefault("info", film.info(film.size))
+    about = {  # in LeRobot's order
+        "codebase_version": layout.VERSION,
+        "fps": fps,
+        "features": features,
+        "total_episodes": totals.episodes,
+        "total_frames": totals.frames,
+        "total_tasks": len(totals.tasks),
+        "chunks_size": layout.CHUNKS_SIZE,
+        "data_files_size_in_mb": layout.DATA_FILES_SIZE_IN_MB,
+        "video_files_size_in_mb": layout.VIDEO_FILES_SIZE_IN_MB,
+        "data_path": layout.DATA_PATH,
+        "video_path": layout.VIDEO_PATH if films else None,
+        "robot_type": robot_type or None,
+        "splits": {"train": f"0:{totals.episodes}"},
+    }
+    layout.write_json(folder / layout.INFO, about)
+    tasks = layout.tasks_table(list(totals.tasks))
+    pq.write_table(tasks, folder / layout.TASKS, write_page_checksum=True)
+    layout.write_json(folder / layout.STATS, to_lists(totals.statistics))
+
+
+def _rows(
+    episodes: Iterable[EpisodeData],
+    features: layout.Features,
+    fps: float,
+    data: ParquetFiles,
+    films: Mapping[str, CameraFiles],
+    totals: _Totals,
+) -> Iterator[dict[str, Any]]:
+    """Write the columns and films of each episode, then yield its row of `meta/episodes`."""
+    schema: pa.Schema | None = None
+    for number, episode in enumerate(episodes):
+        length = len(episode.tasks)
+        frame = np.arange(length)
+        tasks = [totals.tasks.setdefault(text, len(totals.tasks)) for text in episode.tasks]
+        numbered = {
+            layout.TIMESTAMP: (frame / fps).astype(np.float32),
+            layout.FRAME_INDEX: frame,
+            layout.EPISODE_INDEX: np.full(length, number),
+            layout.INDEX: frame + totals.frames,
+            layout.TASK_INDEX: np.array(tasks),
         }
-        self.features = {key: {**one, "shape": tuple(one["shape"])} for key, one in {**features, **index}.items()}
-        self._folder = folder
-        self._fps, self._robot_type = fps if fps % 1 else int(fps), robot_type
-        self._schema: pa.Schema | None = None  # known with the first episode
-        self._data = ParquetFiles(folder, layout.DATA_PATH, _GROUP_ROWS)
-        self._meta = ParquetFiles(folder, layout.EPISODES_PATH)
-        self._rows: list[dict[str, Any]] = []
-        self._row_schema: pa.Schema | None = None  # schema of the first rows written
-        films = [key for key, feature in features.items() if feature["dtype"] == "video"]
-        self.films = {key: CameraFiles(folder, key, video, fps) for key in films}
-        self._pooled: Statistics = {}
-        self._tasks: dict[str, int] = {}  # text -> index, in order of first appearance
-        self.episodes = self.frames = 0
-
-    def add_columns(
-        self,
-        columns: Mapping[str, Column],
-        tasks: Sequence[str],
-        others: Mapping[str, Any],
-        stored: StoredEpisode | None = None,
-        *,
-        cut: bool = False,
-    ) -> None:
-        """Append an episode. Raises what writing raises.
-
-        Args:
-            columns: (T,) or (T, ...), pictures (T, height, width, 3).
-            tasks: Text of every frame.
-            others: Columns of `meta/episodes` that LeRobot does not have, and their values.
-            stored: Has the films that are not in `columns`, and the statistics of pictures that are not decoded there.
-            cut: Copy only the episode's part of a film.
-        """
-        numbers = np.array([self._tasks.setdefault(text, len(self._tasks)) for text in tasks], np.int64)
-        columns, statistics = self._fit({**self._index_columns(numbers), **columns}, stored)
-        self._schema = self._schema or layout.data_schema(self.features, columns)
-        chunk, file = self._data.write(to_table(columns, self._schema))
+        columns = {**numbered, **episode.columns}
+        columns, statistics = _fit(columns, features, episode.picture_statistics)
+        schema = schema or layout.data_schema(features, columns)
+        chunk, file = data.write(to_table(columns, schema))
         row: dict[str, Any] = {
-            layout.EPISODE_INDEX: self.episodes,
-            "tasks": list(dict.fromkeys(tasks)),
-            "length": len(tasks),
+            layout.EPISODE_INDEX: number,
+            "tasks": list(dict.fromkeys(episode.tasks)),
+            "length": length,
             "data/chunk_index": chunk,
             "data/file_index": file,
-            "dataset_from_index": self.frames,
-            "dataset_to_index": self.frames + len(tasks),
-            **others,
+            "dataset_from_index": totals.frames,
+            "dataset_to_index": totals.frames + length,
+            **episode.others,
         }
-        for key, film in self.films.items():
-            copied = stored if key not in columns else None
-            clip = film.copy(copied, cut=cut) if copied else film.write(columns[key])
-            row |= {
-                f"videos/{key}/chunk_index": clip.chunk,
-                f"videos/{key}/file_index": clip.file,
-                f"videos/{key}/from_timestamp": clip.first / self._fps,
-                f"videos/{key}/to_timestamp": (clip.first + clip.frames) / self._fps,
-            }
+        for key, film in films.items():
+            row |= film.write(columns[key]) if key in columns else film.copy(episode)
         for key, table in to_lists(statistics).items():
             row |= {f"stats/{key}/{name}": values for name, values in table.items()}
-        chunk, file = self._meta.next_place()
-        row |= {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
-        self._rows.append(row)
-        if len(self._rows) == _GROUP_EPISODES:
-            self._write_rows()
-        self._pooled = pool(self._pooled, statistics) if self._pooled else statistics
-        self.episodes += 1
-        self.frames += len(numbers)
+        totals.statistics = pool(totals.statistics, statistics) if totals.statistics else statistics
+        totals.episodes += 1
+        totals.frames += length
+        yield row
 
-    def close_files(self) -> None:
-        """Write `info.json`, tasks and statistics, and close all files. Raises `ManipError` if no episode was added."""
-        if not self.episodes:
-            raise ManipError("there are no episodes to write")
-        self._write_rows()
-        for files in (self._data, self._meta, *self.films.values()):
-            files.close()
-        table = {key: {**feature, "shape": list(feature["shape"])} for key, feature in self.features.items()}
-        for key, film in self.films.items():
-            if film.encodes:
-                table[key].setdefault("info", film.info())
-        about = {  # in LeRobot's order
-            "codebase_version": layout.VERSION,
-            "fps": self._fps,
-            "features": table,
-            "total_episodes": self.episodes,
-            "total_frames": self.frames,
-            "total_tasks": len(self._tasks),
-            "chunks_size": layout.CHUNKS_SIZE,
-            "data_files_size_in_mb": layout.DATA_FILES_SIZE_IN_MB,
-            "video_files_size_in_mb": layout.VIDEO_FILES_SIZE_IN_MB,
-            "data_path": layout.DATA_PATH,
-            "video_path": layout.VIDEO_PATH if self.films else None,
-            "robot_type": self._robot_type,
-            "splits": {"train": f"0:{self.episodes}"},
-        }
-        layout.write_json(self._folder / layout.INFO, about)
-        tasks = layout.tasks_table(list(self._tasks))
-        pq.write_table(tasks, self._folder / layout.TASKS, write_page_checksum=True)
-        layout.write_json(self._folder / layout.STATS, to_lists(self._pooled))
 
-    def close(self) -> None:
-        """Close all files, complete or not."""
-        for files in (self._data, self._meta, *self.films.values()):
-            with suppress(OSError):  # a full disk was already reported
-                files.close()
+def _fit(
+    given: Mapping[str, Column], features: layout.Features, stored: Statistics
+) -> tuple[dict[str, Column], Statistics]:
+    """Return an episode's columns in the order and shapes of the features, and their statistics.
 
-    def _index_columns(self, tasks: I64) -> Columns:
-        frame = np.arange(len(tasks), dtype=np.int64)
-        return {
-            layout.TIMESTAMP: (frame / self._fps).astype(np.float32),
-            layout.FRAME_INDEX: frame,
-            layout.EPISODE_INDEX: np.full(len(tasks), self.episodes, dtype=np.int64),
-            layout.INDEX: frame + self.frames,
-            layout.TASK_INDEX: tasks,
-        }
-
-    def _fit(self, given: Mapping[str, Column], stored: StoredEpisode | None) -> tuple[dict[str, Column], Statistics]:
-        """Return an episode's columns in the order and shapes of the features, and their statistics."""
-        columns = {key: given[key] for key in self.features if key in given}
-        statistics = dict(stored.picture_statistics) if stored else {}
-        numbers: dict[str, NDArray[Any]] = {}
-        for key, values in columns.items():
-            if stored and key in self.films and isinstance(values, pa.ChunkedArray):  # PNGs become a film
-                with reading(stored.dataset.root):
-                    values = np.stack([decode_picture(cell["bytes"]) for cell in values.to_pylist()])
-                columns[key] = values
-            if not isinstance(values, np.ndarray):
-                continue
-            if self.features[key]["dtype"] in PICTURES:
+    stored: statistics of the pictures that are not decoded here.
+    """
+    columns: dict[str, Column] = {}
+    statistics = dict(stored)
+    for key, feature in features.items():
+        if key not in given:  # a film that is copied
+            continue
+        values = given[key]
+        if feature["dtype"] == "video" and isinstance(values, pa.ChunkedArray):  # PNGs become a film
+            with reading(Path(key)):
+                values = np.stack([decode_picture(cell["bytes"]) for cell in values.to_pylist()])
+        if isinstance(values, np.ndarray):
+            if feature["dtype"] in PICTURES:
                 statistics[key] = picture_statistics(values)
-                continue
-            columns[key] = values.reshape(-1) if self.features[key]["shape"] == (1,) else values
-            if values.dtype.kind not in "OU":
-                numbers[key] = columns[key]
-        statistics |= column_statistics(numbers)
-        return columns, {key: statistics[key] for key in self.features if key in statistics}
-
-    def _write_rows(self) -> None:
-        """Write the rows of meta/episodes that are still in memory."""
-        if self._rows:
-            table = pa.Table.from_pylist(self._rows, self._row_schema)
-            self._meta.write(table)
-            self._rows, self._row_schema = [], table.schema
+            else:
+                values = values.reshape(-1) if feature["shape"] == (1,) else values
+                if values.dtype.kind not in "OU":
+                    statistics |= column_statistics({key: values})
+        columns[key] = values
+    return columns, {key: statistics[key] for key in features if key in statistics}

@@ -7,7 +7,7 @@ keeps the column, its split and delete drop it; the draws are also part of `sim_
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
@@ -70,7 +70,8 @@ class ParquetFiles:
         if self._waiting:
             self._flush()
         if self._writer is not None:
-            writer, self._writer = self._writer, None  # first, so that an error on closing is raised once
+            writer = self._writer
+            self._writer = None  # first, so that an error on closing is raised once
             writer.close()
             self._number += 1
 
@@ -112,7 +113,8 @@ def to_table(columns: Mapping[str, Column], schema: pa.Schema) -> pa.Table:
 def _to_png(picture: NDArray[np.uint8]) -> bytes:
     """Return a picture (height, width, 3) as the content of a PNG file."""
     stream = BytesIO()
-    Image.fromarray(picture).save(stream, "PNG", compress_level=1)  # higher levels save a tenth and take twice as long
+    # higher levels save a tenth and take twice as long
+    Image.fromarray(picture).save(stream, "PNG", compress_level=1)
     return stream.getvalue()
 
 
@@ -150,24 +152,32 @@ def read_tasks(root: Path) -> dict[int, str]:
     """Return the task texts by `task_index`. The file has them in pandas' index column, which may have no name."""
     path = root / layout.TASKS
     with reading(path):
-        table = read_file(path, column_names(path))
-        texts = [one.name for one in table.schema if one.type in (pa.string(), pa.large_string())]
-        name = "task" if "task" in texts else texts[-1]  # pandas writes the index after the columns
-        return dict(zip(table.column(layout.TASK_INDEX).to_pylist(), table.column(name).to_pylist(), strict=True))
+        names = column_names(path)
+        table = read_file(path, names)
+        name = "task" if "task" in names else names[-1]  # pandas writes the index after the columns
+        return dict(
+            zip(
+                table.column(layout.TASK_INDEX).to_pylist(),
+                table.column(name).to_pylist(),
+                strict=True,
+            )
+        )
 
 
-def to_numpy(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
-    """Return a column, (T,) or (T, *shape), with its feature's dtype; text as objects.
+def to_numpy(column: pa.ChunkedArray, feature: Feature) -> Column:
+    """Return a column of numbers, (T,) or (T, *shape), with its feature's dtype; others as they are.
 
     Raises `ValueError` if values have another kind or shape, or are missing.
     """
+    if feature.dtype not in NUMBERS:
+        return column
     array: Any = column.combine_chunks()
     is_vector = feature.size > 1
     while isinstance(array, pa.ExtensionArray | pa.ListArray | pa.FixedSizeListArray):
-        array, is_vector = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten(), True
-    dtype = np.dtype(feature.dtype if feature.dtype in NUMBERS else object)
+        array = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten()
+        is_vector = True
     try:  # files may hold narrower numbers
-        values = array.to_numpy(zero_copy_only=False).astype(dtype, casting="same_kind", copy=False)
+        values = array.to_numpy(zero_copy_only=False).astype(feature.dtype, casting="same_kind", copy=False)
         return values.reshape(len(column), *feature.shape if is_vector else ())
     except (TypeError, ValueError) as error:
         what = f"{feature.dtype} of shape {list(feature.shape)}"
@@ -203,28 +213,23 @@ class EpisodeTable:
 
 def read_episode_table(root: Path, info: Info) -> EpisodeTable:
     """Read `meta/episodes`, without statistics. Raises `ManipError` naming a file that cannot be read."""
-    paths = sorted(root.glob(layout.EPISODES_FILES))
-    if not paths:
-        raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
     with reading(root / "meta/episodes"):
-        tables = [
-            read_file(path, [name for name in column_names(path) if not name.startswith("stats/")]) for path in paths
-        ]
-        table = pa.concat_tables(tables, promote_options="permissive")
+        table = _read_rows(root, lambda name: not name.startswith("stats/"))
 
         def numbers(name: str) -> I64:
             return table.column(name).cast(pa.int64()).to_numpy()
 
         def clips(key: str) -> VideoSpans:
-            places = zip(
-                *(numbers(f"videos/{key}/{name}").tolist() for name in ("chunk_index", "file_index")), strict=True
-            )
-            files = [
-                layout.VIDEO_PATH.format(chunk_index=chunk, file_index=file, video_key=key) for chunk, file in places
+            chunks = numbers(f"videos/{key}/chunk_index").tolist()
+            files = numbers(f"videos/{key}/file_index").tolist()
+            paths = [
+                layout.VIDEO_PATH.format(chunk_index=chunk, file_index=file, video_key=key)
+                for chunk, file in zip(chunks, files, strict=True)
             ]
-            return VideoSpans(files, table.column(f"videos/{key}/from_timestamp").to_numpy())
+            return VideoSpans(paths, table.column(f"videos/{key}/from_timestamp").to_numpy())
 
         tasks = table.column("tasks").to_pylist() if "tasks" in table.column_names else [None] * len(table)
+        others = [name for name in table.column_names if not _EPISODE_COLUMNS.fullmatch(name)]
         return EpisodeTable(
             index=numbers(layout.EPISODE_INDEX),
             length=numbers("length"),
@@ -232,20 +237,27 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
             stop=numbers("dataset_to_index"),
             tasks=[texts or [] for texts in tasks],
             clips={feature.key: clips(feature.key) for feature in info.of_dtype("video")},
-            others=table.select([one for one in table.column_names if not _EPISODE_COLUMNS.fullmatch(one)]).to_pylist(),
+            others=table.select(others).to_pylist(),
         )
 
 
 def read_picture_statistics(root: Path, cameras: Sequence[str]) -> list[Statistics]:
     """Return the stored statistics of every episode's pictures, by camera column."""
     found: list[Statistics] = []
-    for path in sorted(root.glob(layout.EPISODES_FILES)):
-        names = {f"stats/{key}/{name}": (key, name) for key in cameras for name in layout.STAT_NAMES}
-        here = [name for name in column_names(path) if name in names]
-        for row in read_file(path, [layout.EPISODE_INDEX, *here]).to_pylist():
-            own: Statistics = {}
-            for column in here:
-                key, name = names[column]
+    columns = {f"stats/{key}/{name}": (key, name) for key in cameras for name in layout.STAT_NAMES}
+    for row in _read_rows(root, lambda name: name in columns or name == layout.EPISODE_INDEX).to_pylist():
+        own: Statistics = {}
+        for column, (key, name) in columns.items():
+            if row.get(column) is not None:
                 own.setdefault(key, {})[name] = np.array(row[column])
-            found.append(own)
+        found.append(own)
     return found
+
+
+def _read_rows(root: Path, wanted: Callable[[str], bool]) -> pa.Table:
+    """Return columns of `meta/episodes`, chosen by name."""
+    paths = sorted(root.glob(layout.EPISODES_FILES))
+    if not paths:
+        raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
+    tables = [read_file(path, [*filter(wanted, column_names(path))]) for path in paths]
+    return pa.concat_tables(tables, promote_options="permissive")

@@ -32,7 +32,12 @@ def column_statistics(columns: Mapping[str, NDArray[Any]]) -> Statistics:
     statistics: Statistics = {}
     for key, values in columns.items():
         rows = np.array(values.reshape(len(values), -1).T, np.float64, order="C")
-        own = {"min": rows.min(axis=1), "max": rows.max(axis=1), "mean": rows.mean(axis=1), "std": rows.std(axis=1)}
+        own = {
+            "min": rows.min(axis=1),
+            "max": rows.max(axis=1),
+            "mean": rows.mean(axis=1),
+            "std": rows.std(axis=1),
+        }
         places = quantile_places(len(values))
         rows.partition(sorted(set(places.values())), axis=1)
         own |= {name: rows[:, place].copy() for name, place in places.items()}
@@ -49,12 +54,11 @@ def picture_statistics(frames: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     counts = counts.reshape(3, len(_LEVELS))
     total, below = int(counts[0].sum()), counts.cumsum(axis=1)
     mean = counts @ _LEVELS / total
+    places = {"min": 0, "max": total - 1, **quantile_places(total)}
     levels = {
-        "min": (counts > 0).argmax(axis=1),
-        "max": _LEVELS[-1] - (counts[:, ::-1] > 0).argmax(axis=1),
         "mean": mean,
         "std": np.sqrt((counts * (_LEVELS - mean[:, None]) ** 2).sum(axis=1) / total),
-        **{name: (below > place).argmax(axis=1) for name, place in quantile_places(total).items()},
+        **{name: (below > place).argmax(axis=1) for name, place in places.items()},
     }
     shaped = {name: values.reshape(3, 1, 1) / 255 for name, values in levels.items()}
     return {name: np.array([len(frames)]) if name == "count" else shaped[name] for name in STAT_NAMES}

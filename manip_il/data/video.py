@@ -10,26 +10,20 @@ import itertools
 import os
 import shutil
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import av
-import av.logging
 import numpy as np
-from av.container import OutputContainer
-from av.packet import Packet
-from av.video.codeccontext import VideoCodecContext
-from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.camera import Pictures, open_video
-from manip_il.data.dataset import Dataset, StoredEpisode
+from manip_il.data.camera import FrameRange, Pictures, open_video
+from manip_il.data.dataset import EpisodeData
 from manip_il.data.info import reading
-from manip_il.data.schema import exact_rate, plain_rate
+from manip_il.data.schema import exact_rate
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import UsageError
 
@@ -37,133 +31,147 @@ from manip_il.errors import UsageError
 _OPTIONS = {"movflags": "faststart", "fflags": "+bitexact"}
 
 
-@dataclass(frozen=True)
-class VideoSpan:
-    """One camera's frames of one episode: `frames` frames of a video file, from frame number `first`."""
-
-    chunk: int
-    file: int
-    first: int
-    frames: int
-
-
 class CameraFiles:
-    """Writes one camera's numbered video files, one at a time; the same episodes give the same bytes."""
+    """Writes one camera's numbered video files, one at a time; the same episodes give the same bytes.
+
+    size: height and width of the written pictures [pixels]; None if films were only copied.
+    """
 
     def __init__(self, folder: Path, key: str, config: VideoConfig, fps: float):
         self._folder = folder
         self._key = key
         self._config = config
-        self._fps = exact_rate(fps)
-        self._limit = layout.VIDEO_FILES_SIZE_IN_MB * 2**20
-        self._number = self._frames = self._bytes = 0
-        self.encodes = False  # whether pictures were written, not only copied
-        self._container: OutputContainer | None = None
-        self._stream: VideoStream | None = None
-        self._copied: dict[tuple[Dataset, Path], tuple[int, int]] = {}  # chunk and file index
+        self._fps = fps
+        self._rate = exact_rate(fps)
+        self._number = 0  # of the open or the next file
+        self._frames = 0  # in the open file
+        self._bytes = 0
+        self._container: Any = None  # the open file
+        self._stream: Any = None
+        self._copied: dict[Any, dict[str, Any]] = {}  # source -> its place in the new dataset
+        self.size: tuple[int, int] | None = None
 
-    def copy(self, episode: StoredEpisode, *, cut: bool = False) -> VideoSpan:
-        """Copy the video file that holds an episode, unless already copied; return the episode's place in it.
-
-        cut: copy only the episode's frames, to a file of their own.
-        """
-        source, first, frames = episode.clips[self._key]
-        if cut or (episode.dataset, source) not in self._copied:
+    def copy(self, episode: EpisodeData) -> dict[str, Any]:
+        """Copy the video file that holds an episode, unless already copied; return the columns of its row."""
+        film = episode.films[self._key]
+        source = episode.dataset, film.path
+        if episode.cut or source not in self._copied:
             self.close()
-            name, chunk, file = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
-            (self._folder / name).parent.mkdir(parents=True, exist_ok=True)
-            if cut:
-                _cut(source, self._folder / name, first, frames, episode.dataset.fps)
+            path, self._copied[source] = self._next_file()
+            if episode.cut:
+                _cut(film, path, self._fps)
             else:
-                with checks.native_path(source, "an MP4 file") as opened:
-                    shutil.copyfile(opened, self._folder / name)
-            self._copied[episode.dataset, source] = chunk, file
+                with checks.native_path(film.path, "an MP4 file") as opened:
+                    shutil.copyfile(opened, path)
             self._number += 1
-        return VideoSpan(*self._copied[episode.dataset, source], 0 if cut else first, frames)
+        return self._copied[source] | self._times(0 if episode.cut else film.first, film.count)
 
-    def write(self, frames: Pictures) -> VideoSpan:
-        """Append the frames of an episode. Raises `av.FFmpegError` if they cannot be encoded or written."""
-        if self._bytes >= self._limit:
+    def write(self, frames: Pictures) -> dict[str, Any]:
+        """Append the frames of an episode; return the columns of its row.
+
+        Raises `av.FFmpegError` if they cannot be encoded or written.
+        """
+        if self._bytes >= layout.VIDEO_FILES_SIZE_IN_MB * 2**20:
             self.close()
-        name, chunk, number = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
-        size = frames.shape[1], frames.shape[2]
-        if self._stream is None:
-            encoder = self._open(self._folder / name, size)
+        path, place = self._next_file()
+        self.size = size = frames.shape[1], frames.shape[2]
+        if self._container is None:
+            self._container = av.open(str(path), "w", options=_OPTIONS)
+            self._stream = self._container.add_stream(self._config.vcodec, self._rate)
+            encoder = self._stream.codec_context
         else:  # a new encoder, so that its bytes do not depend on other episodes
-            encoder = _new_encoder(self._config, size, self._fps)
-        clip = VideoSpan(chunk, number, self._frames, len(frames))
+            encoder = av.CodecContext.create(self._config.vcodec, "w")
+        _set_up(encoder, self._config, size, self._rate)
+        times = self._times(self._frames, len(frames))
         for picture in frames:
-            self._mux(_encode(encoder, _video_frame(picture, self._frames, self._fps)))
+            self._mux(_encode(encoder, _video_frame(picture, self._frames, self._rate)))
             self._frames += 1
         self._mux(_encode(encoder, None))
-        return clip
+        return place | times
 
     def close(self) -> None:
         """Finish the open file, if any. Raises `OSError` if it cannot be written."""
-        # an error on closing is raised once
         container = self._container
-        self._container = None
-        self._stream = None
+        self._container = None  # first, so that an error on closing is raised once
         if container is not None:
-            self._number = self._number + 1
+            self._number += 1
             self._frames = 0
             self._bytes = 0
             container.close()
 
-    def info(self) -> dict[str, Any]:
-        """Return the entry of LeRobot's `info.json` for this camera; its first file must be closed."""
-        path, config = self._folder / layout.numbered(layout.VIDEO_PATH, 0, video_key=self._key)[0], self._config
-        with closing(open_video(path)) as container:
-            stream = container.streams.video[0]
-            found = {
-                "video.height": stream.height,
-                "video.width": stream.width,
-                "video.codec": stream.codec.canonical_name,
-                "video.pix_fmt": stream.pix_fmt,
-                "video.fps": plain_rate(float(stream.base_rate or 0)),
-                "video.channels": len(stream.format.components),
-                "has_audio": False,
-            }
-        settings = {"video.g": config.g, "video.crf": config.crf, "video.preset": config.preset, "video.fast_decode": 0}
-        return {**found, **settings, "video.video_backend": "pyav", "video.extra_options": {}, "is_depth_map": False}
+    def info(self, size: tuple[int, int]) -> dict[str, Any]:
+        """Return the entry of LeRobot's `info.json` for this camera. size: height and width [pixels]."""
+        config = self._config
+        return {
+            "video.height": size[0],
+            "video.width": size[1],
+            "video.codec": av.Codec(config.vcodec, "w").canonical_name,
+            "video.pix_fmt": config.pix_fmt,
+            "video.fps": self._fps,
+            "video.channels": 3,
+            "has_audio": False,
+            "video.g": config.g,
+            "video.crf": config.crf,
+            "video.preset": config.preset,
+            "video.fast_decode": 0,
+            "video.video_backend": "pyav",
+            "video.extra_options": {},
+            "is_depth_map": False,
+        }
 
-    def _open(self, path: Path, size: tuple[int, int]) -> VideoCodecContext:
+    def _next_file(self) -> tuple[Path, dict[str, Any]]:
+        """Return the path of the open or the next file, and its numbers in columns of `meta/episodes`."""
+        name, chunk, file = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
+        path = self._folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.encodes, self._container = True, av.open(str(path), "w", options=_OPTIONS)
-        options = self._config.options()
-        self._stream = cast(VideoStream, self._container.add_stream(self._config.vcodec, self._fps, options=options))
-        _set_up(self._stream.codec_context, self._config, size, self._fps)
-        return self._stream.codec_context
+        return path, {
+            f"videos/{self._key}/chunk_index": chunk,
+            f"videos/{self._key}/file_index": file,
+        }
 
-    def _mux(self, packets: list[Packet]) -> None:
+    def _times(self, first: int, count: int) -> dict[str, Any]:
+        return {
+            f"videos/{self._key}/from_timestamp": first / self._fps,
+            f"videos/{self._key}/to_timestamp": (first + count) / self._fps,
+        }
+
+    def _mux(self, packets: list[Any]) -> None:
         for packet in packets:
-            packet.stream = cast(VideoStream, self._stream)
+            packet.stream = self._stream
             self._bytes += packet.size
-            cast(OutputContainer, self._container).mux_one(packet)
+            self._container.mux_one(packet)
 
 
-def _cut(source: Path, target: Path, first: int, count: int, fps: float) -> None:
-    """Copy `count` frames of a video file as they are encoded. Raises `ManipError` if they need frames before them."""
-    with reading(source), closing(open_video(source)) as film, av.open(str(target), "w", options=_OPTIONS) as container:
-        stream = film.streams.video[0]
-        own, rate = (
-            container.add_stream_from_template(stream, opaque=True),
-            fps * float(stream.time_base or 1),
-        )  # [frames/tick]
-        film.seek(round(first / rate), stream=stream)  # to the last key frame at or before it
-        inside = (one for one in film.demux(stream) if one.size and 0 <= round((one.pts or 0) * rate) - first < count)
-        packets = list(itertools.islice(inside, count))
-        if len(packets) != count or not packets[0].is_keyframe:
-            raise ValueError(f"frames {first} to {first + count - 1} cannot be cut out without encoding them again")
+def _cut(film: FrameRange, target: Path, fps: float) -> None:
+    """Copy frames of a video file as they are encoded. Raises `ManipError` if they need frames before them."""
+    with (
+        reading(film.path),
+        closing(open_video(film.path)) as source,
+        av.open(str(target), "w", options=_OPTIONS) as container,
+    ):
+        stream = source.streams.video[0]
+        own = container.add_stream_from_template(stream, opaque=True)
+        rate = fps * float(stream.time_base or 1)  # [frames/tick]
+        # to the last key frame at or before it
+        source.seek(round(film.first / rate), stream=stream)
+        inside = (
+            packet
+            for packet in source.demux(stream)
+            if packet.size and 0 <= round((packet.pts or 0) * rate) - film.first < film.count
+        )
+        packets: list[Any] = [*itertools.islice(inside, film.count)]
+        if len(packets) != film.count or not packets[0].is_keyframe:
+            last = film.first + film.count - 1
+            raise ValueError(f"frames {film.first} to {last} cannot be cut out without encoding them again")
         start = packets[0].pts or 0
-        for one in packets:
-            one.pts = (one.pts or 0) - start
-            one.dts = (one.dts or 0) - start
-            one.stream = own
-            container.mux_one(one)
+        for packet in packets:
+            packet.pts = (packet.pts or 0) - start
+            packet.dts = (packet.dts or 0) - start
+            packet.stream = own
+            container.mux_one(packet)
 
 
-def _encode(encoder: VideoCodecContext, frame: av.VideoFrame | None) -> list[Packet]:
+def _encode(encoder: Any, frame: av.VideoFrame | None) -> list[Any]:
     """Encode a frame, or None to flush; the first one opens the encoder.
 
     If run by root, SVT-AV1 permanently gives real-time priority (SCHED_FIFO) to the calling thread and to its worker
@@ -178,40 +186,30 @@ def _encode(encoder: VideoCodecContext, frame: av.VideoFrame | None) -> list[Pac
     return packets
 
 
-def _new_encoder(config: VideoConfig, size: tuple[int, int], fps: Fraction) -> VideoCodecContext:
-    encoder = cast(VideoCodecContext, av.CodecContext.create(config.vcodec, "w"))
+def _set_up(encoder: Any, config: VideoConfig, size: tuple[int, int], rate: Fraction) -> None:
+    # errors only; otherwise it prints its version for every encoder
+    os.environ.setdefault("SVT_LOG", "1")
     encoder.options = config.options()
-    _set_up(encoder, config, size, fps)
-    return encoder
-
-
-def _set_up(encoder: VideoCodecContext, config: VideoConfig, size: tuple[int, int], fps: Fraction) -> None:
-    os.environ.setdefault("SVT_LOG", "1")  # errors only; otherwise it prints its version for every encoder
     encoder.height, encoder.width = size
     encoder.pix_fmt = config.pix_fmt
-    encoder.framerate, encoder.time_base = fps, 1 / fps
+    encoder.framerate = rate
+    encoder.time_base = 1 / rate
 
 
-def _video_frame(picture: NDArray[np.uint8], number: int, fps: Fraction) -> av.VideoFrame:
+def _video_frame(picture: NDArray[np.uint8], number: int, rate: Fraction) -> av.VideoFrame:
     frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-    frame.pts, frame.time_base = number, 1 / fps
+    frame.pts, frame.time_base = number, 1 / rate
     return frame
 
 
 def try_encoder(config: VideoConfig, size: tuple[int, int], fps: float) -> None:
-    """Encode one picture of this height and width; raises `UsageError` with the encoder's reason if it fails."""
-    level = av.logging.get_level()
-    av.logging.set_level(av.logging.ERROR)  # otherwise the reason is not logged
-    with av.logging.Capture() as log:
-        try:
-            if len(av.VideoFormat(config.pix_fmt).components) < 3:
-                raise ValueError(f"pixel format {config.pix_fmt} has no colour")
-            rate = exact_rate(fps)
-            encoder = _new_encoder(config, size, rate)
-            _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, rate))
-            _encode(encoder, None)
-        except (av.FFmpegError, ValueError) as error:
-            reason = log[0][2].strip() if log else str(error)
-            raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {config}: {reason}") from error
-        finally:
-            av.logging.set_level(level)
+    """Encode one picture of this height and width; raises `UsageError` if that fails."""
+    rate = exact_rate(fps)
+    try:
+        encoder = av.CodecContext.create(config.vcodec, "w")
+        _set_up(encoder, config, size, rate)
+        _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, rate))
+        _encode(encoder, None)
+    except (av.FFmpegError, ValueError) as error:
+        expected = f"expected even sizes and settings of {config.vcodec}"
+        raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {config}: {error}; {expected}") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import UnknownName
 from manip_il.option import option
 
 # Codec -> default crf and preset. LeRobot's own default is libsvtav1. h264 takes a sixth of its time for equal error,
@@ -16,8 +16,7 @@ CODECS: dict[str, tuple[float, int | str]] = {"h264": (23, "ultrafast"), "libsvt
 class VideoConfig:
     """Settings of the encoder, named as in LeRobot's `RGBEncoderConfig`, with the same defaults for `libsvtav1`.
 
-    Raises `UnknownName` for an unknown codec, `UsageError` for an invalid g; the other settings are checked
-    when `try_encoder` runs the codec.
+    Raises `UnknownName` for an unknown codec; `try_encoder` checks the other settings.
     """
 
     vcodec: str = option("h264", "h264, or libsvtav1 (LeRobot's own choice, slower)")
@@ -29,8 +28,6 @@ class VideoConfig:
     def __post_init__(self) -> None:
         if self.vcodec not in CODECS:
             raise UnknownName("video codec", self.vcodec, CODECS)
-        if self.g is not None and self.g < 1:
-            raise UsageError(f"video setting g={self.g}; expected 1 or more frames between key frames")
         crf, preset = CODECS[self.vcodec]
         object.__setattr__(self, "crf", crf if self.crf is None else self.crf)
         object.__setattr__(self, "preset", preset if self.preset is None else self.preset)

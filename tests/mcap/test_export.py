@@ -123,7 +123,7 @@ def test_a_fractional_rate_comes_back_with_its_exact_times(tmp_path: Path) -> No
     root = lerobots(tmp_path / "d", fps, {"action": FEATURES["action"]}, [frames])
     [path] = export(root, tmp_path / "out")
     assert decoded(path.read_bytes())[-1][1] == 899 * 10**9 // Fraction(fps).limit_denominator(1001)
-    assert list(import_files([path], tmp_path / "new", load_mapping(tmp_path / "out" / MAPPING))) == [900]
+    assert import_files([path], tmp_path / "new", load_mapping(tmp_path / "out" / MAPPING)).frames == 900
     left, right = Dataset.open(root), Dataset.open(tmp_path / "new")
     assert right.fps == fps
     for key in ("action", "timestamp"):
@@ -137,7 +137,7 @@ def test_lerobots_comes_back_with_its_tasks_odd_columns_and_pictures(tmp_path: P
     root = lerobots(tmp_path / "d", 30, FEATURES, frames)
     export(root, tmp_path / "out")
     mapping = load_mapping(tmp_path / "out" / MAPPING)
-    assert list(import_files(list_files(tmp_path / "out"), tmp_path / "new", mapping)) == [4, 5]
+    assert import_files(list_files(tmp_path / "out"), tmp_path / "new", mapping).frames == 9
     left, right = Dataset.open(root), Dataset.open(tmp_path / "new")
     assert (right.fps, right.info.robot) == (30, "")
     texts = [[one.tasks[i] for i in one.columns(["task_index"])["task_index"].tolist()] for one in (left, right)]

@@ -97,7 +97,7 @@ def test_a_file_that_is_cut_or_does_not_fit_the_first_one_leaves_nothing(tmp_pat
     if damage:
         second.write_bytes(first.read_bytes()[:-20])
     with pytest.raises(ManipError, match=why):
-        list(import_files([first, second], tmp_path / "new", load(tmp_path, {"f": feature()})))
+        import_files([first, second], tmp_path / "new", load(tmp_path, {"f": feature()}))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "m.yaml"]
 
 

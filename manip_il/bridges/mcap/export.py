@@ -104,7 +104,7 @@ def _messages(column: Feature, values: Any, times: foxglove.Times) -> foxglove.M
         return foxglove.joint_states(column.labels, values, times)
     unnamed = [column.key] if column.size == 1 else [f"{column.key}_{place}" for place in range(column.size)]
     labels = column.labels if column.names else unnamed  # as in LeRobot
-    return foxglove.scalars(labels, (values.astype(np.int64) if values.dtype == bool else values).tolist())
+    return foxglove.scalars(labels, values.tolist())
 
 
 def _pictures(camera: Camera, start: int, stop: int) -> Iterator[foxglove.U8]:

@@ -28,9 +28,11 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.bridges.mcap.mapping import TASK, TEXT, Mapping, TopicSource, values_at
 from manip_il.data.camera import decode_picture
+from manip_il.data.dataset import EpisodeData
 from manip_il.data.foxglove import NANOSECONDS, frame_times
-from manip_il.data.lerobot_write import new_dataset
-from manip_il.data.schema import exact_rate, plain_rate
+from manip_il.data.info import Info
+from manip_il.data.lerobot_write import write_episodes
+from manip_il.data.schema import exact_rate
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import I64
 
@@ -51,8 +53,10 @@ def list_files(source: Path) -> list[Path]:
     return paths or [source]
 
 
-def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[int]:
-    """Write the files as a dataset, which appears at `root` when it is complete; yield each episode's frame count.
+def import_files(
+    paths: list[Path], root: Path, mapping: Mapping, on_episode: Callable[[], object] = lambda: None
+) -> Info:
+    """Write the files as a dataset, which appears at `root` when it is complete.
 
     All files are first read in a child process with limited memory and time.
 
@@ -60,6 +64,7 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[in
         paths: The files, an episode each.
         root: The new dataset.
         mapping: Its columns.
+        on_episode: Called before each episode is written.
 
     Raises:
         FolderExistsError: `root` is not empty.
@@ -73,15 +78,18 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[in
         dtype = source.dtype if not source.is_camera else "video" if source.video else "image"
         names = ["height", "width", "channels"] if source.is_camera else source.names
         features[key] = {"dtype": dtype, "shape": np.shape(first[key]) or (1,), "names": names}
-    with new_dataset(root, features, plain_rate(mapping.fps), mapping.robot_type) as writer:
+
+    def episodes() -> Iterator[EpisodeData]:
         for path in paths:
             frames = list(read_frames(path, mapping))
             columns = {
                 key: np.array([frame[key] for frame in frames], object if feature["dtype"] == TEXT else None)
                 for key, feature in features.items()
             }
-            writer.add_columns(columns, [frame[TASK] for frame in frames], {})
-            yield len(frames)
+            on_episode()
+            yield EpisodeData(columns, [frame[TASK] for frame in frames])
+
+    return write_episodes(episodes(), root, features, mapping.fps, mapping.robot_type or "")
 
 
 def _read_all(paths: list[Path], mapping: Mapping) -> None:

@@ -28,9 +28,7 @@ def run_mcap_export(options: McapExportOptions) -> None:
 
 def run_mcap_import(options: McapImportOptions) -> None:
     """Import every file; the dataset appears when it is complete."""
-    paths, frames = list_files(options.source), 0
+    paths = list_files(options.source)
     with progress(len(paths), "import") as bar:
-        for count in import_files(paths, options.dataset, load_mapping(options.mapping)):
-            bar.step()
-            frames += count
-    say(f"imported {len(paths):,} episodes, {frames:,} frames to {options.dataset}")
+        info = import_files(paths, options.dataset, load_mapping(options.mapping), bar.step)
+    say(f"imported {info.episodes:,} episodes, {info.frames:,} frames to {options.dataset}")
