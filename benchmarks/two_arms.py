@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw
-
 from manip_il.tasks.stock.aloha.environment import AlohaEnv
 from manip_il.tasks.stock.aloha.expert import AlohaExpert
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 
 OUTPUT = Path(__file__).parent.parent / "docs" / "two_arms.gif"
 HEIGHT, WIDTH, CAMERA = 200, 320, "angle"

@@ -20,7 +20,6 @@ from manip_il.chapter.discriminators import Discriminator
 from manip_il.chapter.learning_config import LONGER, LearningConfig
 from manip_il.chapter.transitions import Transitions, read_demonstrations
 from manip_il.chapter.vector_env import ActionRange, Lockstep, RobotEpisode
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data.dataset import Dataset
 from manip_il.errors import UsageError
 from manip_il.learn.checkpoint import Origin, in_one_line
@@ -28,6 +27,7 @@ from manip_il.learn.network import MLPNetwork, threads
 from manip_il.learn.training_state import PRETRAINED_MODEL, TRAINING_STATE, new_checkpoint, read_step, write_own_files
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
+from manip_il.worlds.table import env_fingerprint, env_spec
 
 
 class Agent:

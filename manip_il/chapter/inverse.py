@@ -28,9 +28,9 @@ from manip_il.tasks.carry.grid import Grid
 from manip_il.tasks.carry.layout import FEATURES, OBSTACLES
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
 from manip_il.tasks.carry.paths import Demonstration, cheapest_path, plan
-from manip_il.tasks.envs import scene_of
 from manip_il.tasks.ladder import AT_GOAL
 from manip_il.tasks.pick_place import OBJECT
+from manip_il.worlds.ladder.envs import scene_of
 
 CARRY = "carry"
 _MOVED = 0.004  # distance from the start beyond which an object counts as moving [m]

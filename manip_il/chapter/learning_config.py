@@ -7,7 +7,7 @@ from pathlib import Path
 
 from manip_il.chapter.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.option import Seeded, check_bounds, option
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 LONGER = 1.5  # default episode length relative to the longest demonstration
 

@@ -17,11 +17,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from manip_il.collect.environments import make_env
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.network import MLPNetwork
 from manip_il.mdp import F32, F64
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import make_env
 
 
 class RobotEpisode:
@@ -43,8 +43,7 @@ class RobotEpisode:
 
     def advance(self, action: F64) -> None:
         """Apply joint targets and the gripper's opening (n,)."""
-        self._env.advance(action)
-        self._held += self._held > 0 or self._env.solved
+        self._held += self._env.step(action).solved or self._held > 0
 
     @property
     def ended(self) -> bool:

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.caching import PerThread
-from manip_il.collect.environments import env_actions, env_fingerprint, env_spec, make_env, make_expert
 from manip_il.collect.scenes import CHUNK, SceneDrawer, Scenes
 from manip_il.collect.workers import map_in_order
 from manip_il.data import schema
@@ -29,12 +28,12 @@ from manip_il.data.info import Info
 from manip_il.data.lerobot_layout import OURS, Features
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
+from manip_il.errors import ManipError, MismatchError, NothingToLearnError
 from manip_il.mdp import F64, Episode, State
 from manip_il.option import NameOrPath
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import EnvConfig, stored_config
-from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.worlds.config import EnvConfig, stored_config
+from manip_il.worlds.table import described_env, env_fingerprint, env_spec, make_env, make_expert
 
 Columns = dict[str, NDArray[Any]]
 _COMPARED = ("model_sha256", "mujoco")  # entries of a fingerprint that affect restored states
@@ -79,6 +78,7 @@ def open_source(
         )
     env = stored_config(spec, robot, task, shape)
     given = env_spec(env)
+    given.require("restored", "record again what you need")
     for what in ("robot", "task", "object", "sim_state_size"):
         if getattr(given, what) != getattr(spec, what):
             raise MismatchError(what, str(root), getattr(spec, what), f"the given {what}", getattr(given, what))
@@ -109,7 +109,7 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
     `rewrite_columns` raise, and `ManipError` if a worker dies.
     """
     source.check_has_no_sag("data relabel")
-    scale, dataset = env_actions(source.env).scale, source.dataset
+    scale, dataset = described_env(source.env).actions.scale, source.dataset
     simulated = {key: value for key, value in dataset.fingerprint.items() if key.endswith("_sha256")}
     fingerprint = {**env_fingerprint(source.env), **simulated}
     own = Own(dataset.spec, fingerprint, {**dataset.provenance, "relabelled": _origin(source)})
@@ -142,6 +142,11 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
     """
     if scenes.branch_steps > 1:
         source.check_has_no_sag("--branch_steps")
+    spec = env_spec(source.env, scenes.cameras)
+    if scenes.anew:
+        spec.require("redrawn", "give --scenes=false")
+    if scenes.conditions:
+        spec.require("varied", "leave out --vary")
     columns = source.dataset.columns([schema.SIM_STATE, schema.ACTION, schema.LABEL_VALID])
     drawn = {
         "scenes": scenes.anew,
@@ -152,7 +157,7 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
     seeds = scenes.numbers[::CHUNK]
     tried = {"seeds": [seeds[0], seeds[-1]], "tried": len(seeds)}
     provenance = {"redrawn": {**_origin(source), **drawn, **vary}, **tried}
-    spec = replace(env_spec(source.env, scenes.cameras), video=False)  # frames are independent scenes
+    spec = replace(spec, video=False)  # frames are independent scenes
     fingerprint = env_fingerprint(source.env, scenes.cameras)
     work = partial(_draw_scenes, source.env, scenes)
     pieces = scenes.chunks(columns[schema.SIM_STATE], _leads(source, columns))
@@ -217,8 +222,6 @@ def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -
 
     The values are bit-equal to what an environment with these cameras observes. Raises `RenderError` without OpenGL.
     """
-    if env.robot in STOCK and not STOCK[env.robot].cameras:
-        raise RenderError(f"{env.robot} has no cameras")
     view = make_env(env, cameras)
     spec = env_spec(env, cameras)
     rows = len(states)

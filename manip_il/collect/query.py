@@ -16,10 +16,11 @@ from typing import Literal
 import numpy as np
 
 from manip_il.collect.drivers import Setting, expert_actions, generators, policy_actions
-from manip_il.collect.rollout import Environment, Gate, Labeller, Rules, Turn, rollout
+from manip_il.collect.rollout import Gate, Rules, Turn, rollout
 from manip_il.errors import UnknownName, UsageError
 from manip_il.mdp import F64, Actor, State, Transition
 from manip_il.seeding import rng_for
+from manip_il.worlds.contract import Environment, Expert
 
 LabelMode = Literal["per_state", "takeover", "branch", "last"]
 """What the expert returns when it is queried.
@@ -140,7 +141,7 @@ def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
     return query.start(setting)
 
 
-def labelled(frames: list[Transition], query: Query, expert: Labeller) -> list[Transition]:
+def labelled(frames: list[Transition], query: Query, expert: Expert) -> list[Transition]:
     """Return an episode's frames. If the query is `one`, first have the expert label one random step."""
     if query.kind == "one":
         step = drawn_step(frames[0].seed, len(frames))
@@ -156,7 +157,7 @@ def cut_at_takeover(frames: list[Transition]) -> tuple[list[Transition], int]:
     return frames, own
 
 
-def branch(env: Environment, expert: Labeller, first: State, seed: int, steps: int) -> Iterator[Transition]:
+def branch(env: Environment, expert: Expert, first: State, seed: int, steps: int) -> Iterator[Transition]:
     """Yield the expert's next steps from a state; the last one is `done`."""
     yield from rollout([env], [seed], expert_actions, Rules(steps), expert, first=first)
 

@@ -9,13 +9,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.journal import Journal, episode_path, list_seeds, read_journal
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 from manip_il.sim.config import Look
+from manip_il.worlds.table import env_fingerprint, env_spec
 
 _LOG = logging.getLogger(__name__)
 OnEpisode = Callable[[Episode], None]

@@ -29,9 +29,10 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.camera import Pictures, open_video
 from manip_il.data.dataset import Dataset, StoredEpisode
 from manip_il.data.info import reading
-from manip_il.data.schema import exact_rate, plain_rate
+from manip_il.data.schema import exact_rate
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import UsageError
+from manip_il.worlds.contract import plain_rate
 
 # bitexact omits the muxer's version; faststart puts the index at the beginning
 _OPTIONS = {"movflags": "faststart", "fflags": "+bitexact"}

@@ -13,7 +13,6 @@ import numpy as np
 
 from manip_il.caching import PerThread
 from manip_il.collect.drivers import ExpertDriver, PolicyDriver
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
@@ -26,12 +25,9 @@ from manip_il.evaluation.suites import suite_conditions
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import F64, Episode, State
 from manip_il.sim.conditions import NOMINAL, Condition, draw, turn_of
-from manip_il.sim.task import objects_in
 from manip_il.sim.world import World
-from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.envs import config_scene
-from manip_il.tasks.stock.envs import described_stock
-from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import described_env, env_fingerprint, env_spec
 
 _LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps for which an episode continues after success, to see whether success lasts
@@ -105,11 +101,10 @@ def evaluate(
 def episode_hold(env: EnvConfig, hold: int | None = HOLD) -> int | None:
     """Return the control steps after success at which an episode ends, None if it continues to the horizon.
 
-    `hold` does not apply to stock environments, which define this themselves.
+    `hold` does not apply to environments that define this themselves.
     """
-    if env.robot not in STOCK:
-        return hold
-    return 0 if STOCK[env.robot].ends_solved else None
+    ends = env_spec(env).ends_solved
+    return hold if ends is None else 0 if ends else None
 
 
 def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
@@ -144,19 +139,9 @@ def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
 
     The hand is named `hand`. The first object that the arm must reach is named `object`.
     """
-    state = State.from_vector(sim_state)
-    if env.robot in STOCK:
-        stock = described_stock(env.robot, env.task)
-        stock.set_state(state)
-        found = stock.positions
-    else:
-        world = _world(config_scene(env))
-        task = world.scene.task
-        world.restore(state.physics, state.variation)
-        found = {"hand": world.ee.position}
-        for name in world.scene.objects:
-            found["object" if name in objects_in(task, world)[:1] else name] = world.pose(name).position
-    return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
+    world = described_env(env)
+    world.set_state(State.from_vector(sim_state))
+    return {name: [round(float(value), 4) for value in at] for name, at in world.positions().items()}
 
 
 def measure(

@@ -12,7 +12,7 @@ two arms there are two openings, each the last number of its arm.
 
 `ee_delta` is a translation [m] and a rotation vector [rad] in the world frame, not the hand's: objects and goals are
 observed in the world frame, so that a motion towards an object has the same numbers for any orientation of the hand,
-and stock environments (robosuite's OSC_POSE, gymnasium-robotics) use the same convention. It is as long as the robot's
+and benchmarks (robosuite's OSC_POSE, gymnasium-robotics) use the same convention. It is as long as the robot's
 action, so that the network's output fits the environment; the numbers between the first six and the opening are 0 and
 are ignored. The arm needs at least six joints. Decoding finds q* near q with FK(q*) = (p + dp, exp(dR) R)
 (`ArmIK.moved`). It recovers the pose up to rounding, but not the joints: an arm with seven joints can move its elbow
@@ -40,11 +40,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.caching import cached_per_thread
-from manip_il.data.schema import GRIPPERS, JOINT_TARGETS, RobotTaskSpec
+from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.mdp import F64
 from manip_il.robots.rotations import rotation_vector
+from manip_il.worlds.contract import GRIPPERS, JOINT_TARGETS
 
 if TYPE_CHECKING:  # importing inverse kinematics takes a second
     from manip_il.learn.checkpoint import Checkpoint

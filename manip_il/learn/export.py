@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from manip_il.data.fingerprint import policy_sha256
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, GRIPPERS, IMAGES, OPENINGS, SERVOS, STATE, TWO_ARMS
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError
 from manip_il.learn.batches import to_float
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.mdp import F64
+from manip_il.worlds.contract import GRIPPERS, OPENINGS, SERVOS, TWO_ARMS
 
 TOLERANCE = 1e-5  # largest difference between the actions of the file and of the checkpoint [rad] or [m]
 SERVO_TOLERANCE = 1e-3  # largest difference for robots in servos' units [degrees]

@@ -10,7 +10,6 @@ import numpy as np
 
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.outputs import ResumableOutput, save_options
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data import schema
 from manip_il.data.json_lines import append_line
 from manip_il.data.schema import RobotTaskSpec
@@ -18,7 +17,8 @@ from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.mdp import Episode
-from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.worlds.config import EnvConfig, make_config
+from manip_il.worlds.table import env_fingerprint, env_spec
 
 from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint

@@ -11,7 +11,9 @@ import mujoco
 import numpy as np
 import pytest
 from kept import label_all
+from manip_il.tasks.stock.table import ROBOT as STOCK
 
+from manip_il import Expert
 from manip_il.collect.edits import (
     SERVED,
     EditSource,
@@ -22,8 +24,6 @@ from manip_il.collect.edits import (
     render_dataset,
     render_states,
 )
-from manip_il.collect.environments import env_fingerprint, env_spec, make_expert
-from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.scenes import CHUNK, Scenes
 from manip_il.collect.workers import map_in_order
@@ -37,9 +37,9 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.variation import part
 from manip_il.sim.world import World
-from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.envs import env_of, scene_of
-from manip_il.tasks.stock.table import ROBOT as STOCK
+from manip_il.worlds.config import EnvConfig, make_config
+from manip_il.worlds.ladder.envs import env_of, scene_of
+from manip_il.worlds.table import env_fingerprint, env_spec, make_expert
 
 from ..damage import digests
 from ..pictures import read_episodes

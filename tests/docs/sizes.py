@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 from manip_il.cli.main import load
 from manip_il.cli.options import options_of
-from manip_il.tasks.stock.table import ROBOTS as STOCK
 
 from .pages import command_of
 

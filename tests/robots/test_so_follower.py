@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from manip_il.collect.environments import env_actions, env_spec
 from manip_il.data.schema import ACTION, LEROBOT_TYPES, SERVOS, STATE, features
 from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.robots import ROBOTS
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import scene_of
+from manip_il.worlds.config import make_config
+from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.table import env_actions, env_spec
 
 from ..scenes import started
 from ..so_follower import Camera, arm, recorders_features

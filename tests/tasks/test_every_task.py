@@ -13,10 +13,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from manip_il import Expert
 from manip_il.collect import environments
 from manip_il.collect.drivers import driver_of
-from manip_il.collect.environments import env_fingerprint, env_spec
-from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.data.schema import EXPERT_PHASE
 from manip_il.mdp import State
@@ -25,10 +24,11 @@ from manip_il.sim.events import STANDARD
 from manip_il.sim.task import NO_PHASE, Instructing, phases
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks import NAMES
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS, get_task
+from manip_il.worlds.config import make_config
+from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.table import env_fingerprint, env_spec
 
 from ..scenes import has_goal, sizes_of, started, still
 from ..tables import SCENES, WITH_A_CUBE, every_scene, every_task

@@ -13,19 +13,19 @@ import trimesh
 import zstandard
 
 import manip_il
+from manip_il import Expert
 from manip_il.cli.main import main
 from manip_il.collect.edits import open_source
-from manip_il.collect.environments import env_fingerprint, env_spec, is_known
-from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UsageError
 from manip_il.sim.rests import LEAST_ROOM
 from manip_il.sim.shape import DENSITY, LIGHTEST, Shape
 from manip_il.sim.world import World
-from manip_il.tasks.config import make_config, stored_config
-from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.grasp import lie_of
+from manip_il.worlds.config import make_config, stored_config
+from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.table import env_fingerprint, env_spec, is_known
 from tests.meshes import MESHES, write_mesh
 
 OBJECT = "object"

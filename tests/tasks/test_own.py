@@ -14,7 +14,6 @@ import zstandard
 import manip_il
 from manip_il.cli.main import main
 from manip_il.collect.edits import open_source
-from manip_il.collect.environments import env_fingerprint, env_spec, is_known
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UnknownName, UsageError
@@ -22,9 +21,10 @@ from manip_il.robots import ROBOTS
 from manip_il.robots import table as robots
 from manip_il.sim.points import point_names
 from manip_il.tasks import table
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import get_task
+from manip_il.worlds.config import make_config
+from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.table import env_fingerprint, env_spec, is_known
 
 PAGE = Path(__file__).parents[2] / "docs" / "new-task.md"
 TOUCH, RAISE = (block.split("```", 1)[0] for block in PAGE.read_text().split("```python\n")[1:])

@@ -19,9 +19,10 @@ from manip_il.bridges.mcap.path import values_at
 from manip_il.bridges.mcap.read import read_messages, read_pictures, read_topics
 from manip_il.data.foxglove import NANOSECONDS, frame_times
 from manip_il.data.lerobot_write import new_dataset
-from manip_il.data.schema import exact_rate, plain_rate
+from manip_il.data.schema import exact_rate
 from manip_il.errors import ManipError, MismatchError, nearest
 from manip_il.mdp import I64
+from manip_il.worlds.contract import plain_rate
 
 Frame = dict[str, Any]  # column -> array or text, and `task`
 

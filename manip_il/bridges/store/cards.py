@@ -23,8 +23,7 @@ from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.lerobot_layout import INFO
 from manip_il.errors import ManipError
 from manip_il.sim.conditions import NOMINAL
-from manip_il.tasks import ENV_IDS
-from manip_il.tasks.stock.table import ALOHA
+from manip_il.worlds.table import world_of
 
 _OURS = b"<!-- written by manip-il push -->"  # a card with this line is ours and is replaced
 
@@ -78,19 +77,11 @@ def policy_facts(root: Path) -> dict[str, Any]:
     order = ("is_test", "n_episodes", "success_rate")
     facts["evaluation"] = max(evaluations, key=lambda one: [one[key] for key in order], default={})
     fitted_to = Dataset.open(root / "dataset").info if (root / "dataset" / INFO).is_file() else None
-    words = lerobot_words(facts["manip_il"].get("robot"), facts["manip_il"].get("task") or "")
+    robot, task = (facts["manip_il"].get(name) or "" for name in ("robot", "task"))
+    words = world_of(robot).lerobot_words(robot, task)
     return {
         **facts,
         "is_ours": bool(facts["manip_il"]),
         "lerobot_words": words,
         "fitted_to": fitted_to,
     }
-
-
-def lerobot_words(robot: str | None, task: str) -> list[str]:
-    """Return `lerobot-eval`'s options for a robot and task; [] if they are not built in."""
-    name, colon, argument = task.partition(":")
-    if robot == ALOHA:
-        return ["--env.type=aloha", f"--env.task={task}"]
-    named = next((env_id for env_id, names in ENV_IDS.items() if names == (robot, name)), None)
-    return ["--env.type=manip_il", f"--env.task={named.partition('/')[2]}{colon}{argument}"] if named else []

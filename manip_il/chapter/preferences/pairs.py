@@ -16,9 +16,9 @@ from manip_il import checks
 from manip_il.chapter.preferences.frames import Frames, read_all
 from manip_il.chapter.reward import LearnedReward
 from manip_il.data.build import dataset_sha256
-from manip_il.data.fingerprint import canonical_json
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import F32, F64, I64
+from manip_il.worlds.fingerprint import canonical_json
 
 Members = Callable[[F32], F64]  # maps inputs (B, d) to the rewards (M, B) of M networks
 POOL = 10  # candidates per pair when choosing by disagreement

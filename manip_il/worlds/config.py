@@ -6,23 +6,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from manip_il.checks import check_unchanged
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import UsageError
 from manip_il.option import NameOrPath, check_bounds, make_options, option, typed
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import MOST_HZ, Episodes
-from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
+from manip_il.sim.shape import SHAPE_HELP
 from manip_il.tasks import NAMES, SEVERAL
-from manip_il.tasks.stock import table as stock
+from manip_il.worlds.table import WORLDS, world_of
 
-LIMITS_HZ = 20  # control rate for which tasks give their limits [Hz]; at other rates they last as many seconds
 ROBOT_HELP = (
-    f"{', '.join(ROBOTS)}, the path of your own arm's YAML, or {stock.ROBOT} or {stock.ALOHA}: gymnasium-robotics' "
-    "Fetch and gym_aloha's two arms, unmodified"
+    f"{', '.join(ROBOTS)}, the path of your own arm's YAML, or, unmodified, "
+    f"{', '.join(f'{name} ({world.about})' for name, world in WORLDS.items())}"
 )
 TASK_HELP = (
-    f"{', '.join((*NAMES, *SEVERAL))}, or the path of your own task's Python file; with {stock.ROBOT}, "
-    f"{', '.join(stock.STOCK)}; with {stock.ALOHA}, {', '.join(stock.ALOHA_TASKS)}"
+    f"{', '.join((*NAMES, *SEVERAL))}, or the path of your own task's Python file; "
+    f"{'; '.join(f'with {name}, ' + ', '.join(world.tasks) for name, world in WORLDS.items())}"
 )
 
 
@@ -97,7 +95,7 @@ def complete(config: EnvConfig) -> EnvConfig:
             f"control_hz is {config.control_hz}; expected a whole number, as environments are simulated at one"
         )
     check_bounds(config)
-    config = _of_stock(config) if config.robot in stock.ROBOTS else _with_task(config)
+    config = world_of(config.robot).complete(config)
     if not 1 <= config.control_hz <= MOST_HZ:
         raise UsageError(f"control_hz is {config.control_hz}; expected 1 to {MOST_HZ}")
     if not 0 < config.tolerance < 1:
@@ -109,47 +107,3 @@ def complete(config: EnvConfig) -> EnvConfig:
             f"horizon is {config.horizon}, success_steps {config.success_steps}; expected horizon >= success_steps >= 1"
         )
     return config
-
-
-def _with_task(config: EnvConfig) -> EnvConfig:
-    """Canonicalise the object (the default becomes "") and the task's argument; fill in rate and limits."""
-    from manip_il.robots.table import get_robot  # imported here: help needs no robot and no simulator
-    from manip_il.sim.mesh import mesh_path
-    from manip_il.sim.task import TakesArgument
-    from manip_il.tasks.table import get_task
-
-    task, robot = get_task(config.task), get_robot(config.robot)
-    for file in (config.task, config.robot, mesh_path(config.object)):
-        if isinstance(file, Path):
-            check_unchanged(file)
-    if isinstance(task, TakesArgument):
-        config = replace(config, task=task.name)
-    if config.object:
-        shape, other = Shape.parse(config.object), get_task(config.task, config.object)
-        is_own = shape == getattr(task, "shape", CUBE)
-        named = config.object if isinstance(config.object, Path) else str(shape)
-        task, config = task if is_own else other, replace(config, object="" if is_own else named)
-    limits, control_hz = task.limits, config.control_hz or robot.fps
-    rate = control_hz / LIMITS_HZ
-    return replace(
-        config,
-        control_hz=control_hz,
-        tolerance=config.tolerance or limits.tolerance,
-        success_steps=config.success_steps or max(1, round(limits.success_steps * rate)),
-        horizon=config.horizon or max(1, round(limits.horizon * rate)),
-    )
-
-
-def _of_stock(config: EnvConfig) -> EnvConfig:
-    """Return settings with the stock robot's fixed values; raises `UsageError` if another value was given."""
-    robot = stock.ROBOTS[config.robot]
-    if config.task not in robot.tasks:
-        raise UnknownName(f"task of {config.robot}", str(config.task), robot.tasks)
-    if config.object:
-        raise UsageError(f"object is {config.object}; {config.robot} is unmodified, so omit --task.object")
-    for name, value in robot.fixed.items():
-        given = getattr(config, name)
-        if given not in (0, value):
-            raise UsageError(f"{name} is {given:g}; {config.robot} is unmodified, expected {value:g}")
-    settings: dict[str, Any] = {"horizon": config.horizon or robot.horizon, **robot.fixed}
-    return replace(config, **settings)

@@ -9,9 +9,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from manip_il.tasks.stock.aloha import environment
+from manip_il.tasks.stock.aloha.environment import INSTALL, AlohaEnv
+from manip_il.tasks.stock.table import ALOHA, ALOHA_TASKS
 
 from manip_il.collect.drivers import ExpertDriver
-from manip_il.collect.environments import env_spec, make_env, make_expert
 from manip_il.collect.job import RolloutJob
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.runner import episode_hold, positions
@@ -19,10 +21,8 @@ from manip_il.learn.action_spaces import conversion_for
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.stock.aloha import environment
-from manip_il.tasks.stock.aloha.environment import INSTALL, AlohaEnv
-from manip_il.tasks.stock.table import ALOHA, ALOHA_TASKS
+from manip_il.worlds.config import EnvConfig, make_config
+from manip_il.worlds.table import env_spec, make_env, make_expert
 
 every_task = pytest.mark.parametrize("task", list(ALOHA_TASKS))
 TRANSFER, INSERTION = ALOHA_TASKS

@@ -5,9 +5,11 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
+from manip_il.tasks.stock.environment import StockEnv
+from manip_il.tasks.stock.expert import StockExpert
+from manip_il.tasks.stock.table import ACTION_MEANING, CONTROL_HZ, HORIZON, ROBOT, STOCK
 
 from manip_il.collect.drivers import Driver, ExpertDriver, NoisyExpertDriver
-from manip_il.collect.environments import env_actions, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.errors import MismatchError
 from manip_il.evaluation.runner import positions
@@ -15,10 +17,8 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
-from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.stock.environment import StockEnv
-from manip_il.tasks.stock.expert import StockExpert
-from manip_il.tasks.stock.table import ACTION_MEANING, CONTROL_HZ, HORIZON, ROBOT, STOCK
+from manip_il.worlds.config import EnvConfig, make_config
+from manip_il.worlds.table import env_actions, env_spec
 
 every_stock = pytest.mark.parametrize("task", list(STOCK))
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_between, turned_towards
-from manip_il.tasks.stock.base import StockRung, always
-from manip_il.tasks.stock.table import SIDES, AlohaTask, Held
+from manip_il.worlds.aloha.tasks import SIDES, AlohaTask, Held
+from manip_il.worlds.packaged import PackagedRung, always
 
 FINGER_AT_TOUCH = 0.0224  # position of a finger joint at which the fingers would touch [m]
 GRASP_AHEAD = -0.002  # offset of a held object from the hand's site along the fingers [m]
@@ -127,19 +126,28 @@ class AlohaScene:
             return _within(off, HELD_AROUND) and angle < HELD_ANGLE
         return _within(off, AROUND) and angle < ANGLE
 
-    def observed(self) -> F64:
-        """Return `environment_state`, (k,), as the task's `observed` names it."""
-        numbers = list[NDArray[Any] | Sequence[float]]()
-        for hand in self.hands.values():
-            numbers += [hand.position, hand.rotation[:, 0], hand.rotation[:, 1]]
+    def observed(self) -> dict[str, F64]:
+        """Return the entries of `environment_state` by name: lengths [m], columns of rotations, contacts (0, 1)."""
+        found = dict[str, Any]()
+        for side, hand in self.hands.items():
+            found[f"{side}_ee"] = hand.position
+            found[f"{side}_ahead"] = hand.rotation[:, 0]
+            found[f"{side}_across"] = hand.rotation[:, 1]
         for name, thing in self.things.items():
-            numbers += [thing.position, thing.frame[:, 0], thing.frame[:, 2], [self.on_table(name)]]
+            found[name] = thing.position
+            found[f"{name}_ahead"] = thing.frame[:, 0]
+            found[f"{name}_up"] = thing.frame[:, 2]
+            found[f"{name}_on_table"] = self.on_table(name)
             for side, hand in self.hands.items():
-                numbers += [hand.sees(thing.position), self.touches(side, name)]
+                found[f"{name}_from_{side}"] = hand.sees(thing.position)
+                touched = zip(SIDES, self.touches(side, name), strict=True)
+                found |= {f"{name}_touched.{side}.{finger}": touches for finger, touches in touched}
         if self.task.inserted:
-            inner, outer = (self.things[name] for name in self.task.inserted)
-            numbers += [outer.frame.T @ (inner.position - outer.position), outer.frame.T @ inner.frame[:, 0]]
-        return np.concatenate([np.asarray(one, np.float64) for one in numbers])
+            one, other = self.task.inserted
+            inner, outer = self.things[one], self.things[other]
+            found[f"{one}_from_{other}"] = outer.frame.T @ (inner.position - outer.position)
+            found[f"{one}_ahead_in_{other}"] = outer.frame.T @ inner.frame[:, 0]
+        return found
 
     def _meet(self, one: str, other: str) -> bool:
         pair = {self._model.body(one).id, self._model.body(other).id}
@@ -219,13 +227,13 @@ def approach(
     return HandTarget(hand.position + way, rotation, OPEN, longest)
 
 
-def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[StockRung, StockRung]:
+def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[PackagedRung, PackagedRung]:
     """Return the rungs of a hand that takes an object from the table. grasp: scene -> the hand's rotation, (3, 3)."""
     return (
-        StockRung(
+        PackagedRung(
             "grasp", lambda one: one.is_at_grasp(side, name, grasp(one)), lambda one: close_on(one, name, grasp(one))
         ),
-        StockRung("approach", always, lambda one: approach(one, side, name, grasp(one))),
+        PackagedRung("approach", always, lambda one: approach(one, side, name, grasp(one))),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from importlib import import_module
+from typing import override
 
 import mujoco
 import numpy as np
@@ -11,11 +12,12 @@ import numpy as np
 from manip_il.mdp import F64, Label, State
 from manip_il.robots.ik import PoseProgram
 from manip_il.robots.rotations import turned_towards
-from manip_il.tasks.stock.aloha import insertion, transfer
-from manip_il.tasks.stock.aloha.environment import AlohaEnv
-from manip_il.tasks.stock.aloha.ladder import AlohaScene, Hand, HandTarget
-from manip_il.tasks.stock.base import StockRung
-from manip_il.tasks.stock.table import SIDES
+from manip_il.worlds.aloha import insertion, transfer
+from manip_il.worlds.aloha.environment import AlohaEnv
+from manip_il.worlds.aloha.ladder import AlohaScene, Hand, HandTarget
+from manip_il.worlds.aloha.tasks import SIDES
+from manip_il.worlds.contract import Environment, Expert
+from manip_il.worlds.packaged import Packaged, PackagedRung
 
 ORIENTATION, POSTURE = 0.3, 0.003  # costs [1/rad], relative to 1 [1/m] for the position
 ROLL, STRAIGHT = 0.15, (0.15, 0.35)  # forearm roll's cost at a straight wrist; peak's width, wrist up and down [rad]
@@ -27,14 +29,14 @@ CREEPS = 0.95  # share of the breakaway lead below which a joint creeps
 BREAKAWAY = 1.5  # step of a joint per lead beyond it
 
 
-LADDERS: dict[str, tuple[type[AlohaScene], dict[str, tuple[StockRung, ...]]]] = {
+LADDERS: dict[str, tuple[type[AlohaScene], dict[str, tuple[PackagedRung, ...]]]] = {
     "AlohaTransferCube-v0": (transfer.Transfer, transfer.RUNGS),
     "AlohaInsertion-v0": (insertion.Insertion, insertion.RUNGS),
 }
 
 
-class AlohaExpert:
-    """Labels any state of one task. The same state gives bit-equal labels in any order and process."""
+class AlohaExpert(Expert):
+    """Labels any state of one task."""
 
     def __init__(self, task: str):
         self._env = AlohaEnv(task)
@@ -42,8 +44,8 @@ class AlohaExpert:
         self._pairs = {pair: number for number, pair in enumerate(self._env.task.phases)}
         self._arms = {side: _Arm(self._env, number, side) for number, side in enumerate(SIDES)}
 
-    def label(self, state: State, world: object | None = None) -> Label:
-        """Return the expert's label of `state`, action (14,). Raises `MismatchError` for another task's state."""
+    @override
+    def label(self, state: State, environment: Environment | None = None) -> Label:
         env = self._env
         env.set_state(state)
         scene = env.scene(self._kind)
@@ -135,3 +137,18 @@ def _alone(side: str) -> mujoco.MjModel:
     for geom in list(spec.geoms):
         spec.delete(geom)
     return spec.compile()
+
+
+class _Aloha(Packaged):
+    @override
+    def lerobot_words(self, robot: str, task: str) -> list[str]:
+        return ["--env.type=aloha", f"--env.task={task}"]
+
+
+WORLD = _Aloha(
+    AlohaEnv,
+    AlohaExpert,
+    AlohaEnv.robot,
+    {"control_hz": AlohaEnv.control_hz, "tolerance": 0.05, "success_steps": 1},  # the reward shows when it is solved
+    AlohaEnv.horizon,
+)
