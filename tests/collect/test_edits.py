@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 import pytest
 from kept import label_all
-from manip_il.tasks.stock.table import ROBOT as STOCK
 
 from manip_il import Expert
 from manip_il.collect.edits import (
@@ -94,7 +93,7 @@ def test_labels_given_afterwards_elsewhere_in_another_order_are_those_given_whil
                 np.testing.assert_array_equal(labels.reshape(episode.columns[key].shape), episode.columns[key])
 
 
-@pytest.mark.parametrize("env", [REACH, make_config(STOCK, "FetchReach-v4")], ids=lambda env: env.robot)
+@pytest.mark.parametrize("env", [REACH, make_config("fetch_stock", "FetchReach-v4")], ids=lambda env: env.robot)
 def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvConfig, tmp_path):
     [first, second] = recorded(env)
     older = {key: first.columns[key].copy() for key in (schema.ACTION, schema.EXPERT_PHASE)}

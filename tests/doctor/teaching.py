@@ -12,9 +12,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.data import schema as s
 from manip_il.data.build import build
-from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import Journal
 from manip_il.mdp import Episode
+from manip_il.worlds.fingerprint import environment_fingerprint
 
 EPISODES, SIZE, CAMERAS = 12, (48, 64), ("front", "wrist")
 NAMES = ("pan", "lift", "elbow", "wrist", "gripper")

@@ -11,7 +11,6 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
-from manip_il.tasks.stock.table import TWO_ARMS
 
 from manip_il.data.dataset import Dataset
 from manip_il.data.joined import JoinedDatasets
@@ -28,6 +27,7 @@ from manip_il.robots import table as robots
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import LeRobotConfig
 from manip_il.robots.table import get_robot
+from manip_il.worlds.contract import TWO_ARMS
 
 from ..tables import every_large_robot, every_robot
 from .conftest import write_table

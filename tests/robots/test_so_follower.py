@@ -15,7 +15,7 @@ from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
 from manip_il.worlds.config import make_config
 from manip_il.worlds.ladder.envs import scene_of
-from manip_il.worlds.table import env_actions, env_spec
+from manip_il.worlds.table import described_env, env_spec
 
 from ..scenes import started
 from ..so_follower import Camera, arm, recorders_features
@@ -64,7 +64,7 @@ def test_a_measured_state_is_what_the_real_arms_servos_read(real):
 
 
 def test_the_real_arm_goes_where_an_action_sends_the_simulated_one(real):
-    actions = env_actions(make_config("so101", "reach"))
+    actions = described_env(make_config("so101", "reach")).actions
     rng = np.random.default_rng(0)
     for _ in range(20):
         action = rng.uniform(actions.low, actions.high)

@@ -24,7 +24,7 @@ from manip_il.tasks import table
 from manip_il.tasks.table import get_task
 from manip_il.worlds.config import make_config
 from manip_il.worlds.ladder.envs import scene_of
-from manip_il.worlds.table import env_fingerprint, env_spec, is_known
+from manip_il.worlds.table import env_fingerprint, env_spec, world_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "new-task.md"
 TOUCH, RAISE = (block.split("```", 1)[0] for block in PAGE.read_text().split("```python\n")[1:])
@@ -128,7 +128,7 @@ def test_data_and_results_name_a_task_and_run_nothing(touch, tmp_path, monkeypat
     words = ["--dataset.num_episodes=2", "--dataset.root=data", "--workers=1"]
     assert main(["record", f"--task.type={touch}", *words]) == 0
     assert main(["data", "check", "data"]) == 0
-    assert not is_known("panda", "touch")
+    assert world_of("panda").own_files("panda", "touch", "")
     with pytest.raises(ManipError, match="unknown task 'touch'"):
         open_source(tmp_path / "data")
     assert open_source(tmp_path / "data", task=touch).warnings == ()
