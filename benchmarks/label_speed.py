@@ -26,8 +26,8 @@ from manip_il.mdp import State
 from manip_il.robots import ROBOTS, ik
 from manip_il.seeding import stream_seeds
 from manip_il.tasks.table import TASKS
-from manip_il.worlds.config import make_config
 from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.table import make_config
 
 
 def main() -> int:

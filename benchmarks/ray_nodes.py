@@ -28,8 +28,7 @@ from manip_il.collect.ray_pool import run_there
 from manip_il.collect.workers import Engine
 from manip_il.data.journal import Journal
 from manip_il.seeding import stream_seeds
-from manip_il.worlds.config import make_config
-from manip_il.worlds.table import env_fingerprint, env_spec
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 NODES = 4
 TURNS = 5

@@ -38,9 +38,9 @@ from manip_il.seeding import rng_for, stream_base, stream_seeds
 from manip_il.tasks.carry.layout import OBSTACLES, TASTES, Reward, path_features
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
 from manip_il.tasks.pick_place import OBJECT
-from manip_il.worlds.config import EnvConfig, make_config
+from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.ladder.envs import env_of, scene_of
-from manip_il.worlds.table import env_spec
+from manip_il.worlds.table import env_spec, make_config
 
 FEW = 2  # most things in a demonstrated layout
 ARMS = ("panda", "fetch", "so101")

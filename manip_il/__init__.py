@@ -29,7 +29,7 @@ _HOMES = {  # public name -> module, and the name there if it differs
     "State": "mdp",
     "dagger": "api",
     "evaluate": "api",
-    "make_config": "worlds.config",
+    "make_config": "worlds.table",
     "make_env": "worlds.ladder.envs",
     "record": "api",
     "train": "api",

@@ -5,9 +5,9 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.mdp import State
 from manip_il.sim.config import CameraConfig
-from manip_il.worlds.config import make_config
 from manip_il.worlds.ladder.envs import make_env
 from manip_il.worlds.ladder.expert import LadderExpert as Expert
+from manip_il.worlds.table import make_config
 
 __all__ = [
     "CameraConfig",

@@ -36,8 +36,8 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.option import make_options, takes
 from manip_il.seeding import BLOCK, stream_base, stream_seeds
 from manip_il.sim.conditions import NOMINAL
-from manip_il.worlds.config import EnvConfig, make_config, stored_config
-from manip_il.worlds.table import world_of
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import make_config, stored_config, world_of
 
 Policy = Checkpoint | Path | str
 Data = Dataset | Path | str

@@ -98,7 +98,7 @@ def test_a_text_becomes_a_path_only_where_a_person_typed_it():
     assert {(file, function) for file, function, _ in calls("typed")} == {
         ("cli/options.py", "decode"),
         ("lerobot_plugin/environment.py", "_given"),
-        ("worlds/config.py", "make_config"),
+        ("worlds/table.py", "make_config"),
     }
     assert {(file, function) for file, function, _ in calls("make_config")} == {
         ("api.py", "_env"),  # written in Python

@@ -11,8 +11,8 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import Seeded, check_bounds, option
 from manip_il.sim.config import CameraConfig
-from manip_il.worlds.config import EnvConfig, make_config
-from manip_il.worlds.table import env_spec
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import env_spec, make_config
 
 if TYPE_CHECKING:  # so that `manip-il dagger --help` does not import numpy
     from manip_il.collect.query import Query

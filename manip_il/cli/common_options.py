@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Literal
 from manip_il.cli.options import Given, given
 from manip_il.option import option
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
-from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.table import WORLDS, env_spec
+from manip_il.worlds.config import WORLDS, EnvConfig
+from manip_il.worlds.table import env_spec
 
 if TYPE_CHECKING:
     from manip_il.collect.workers import Engine

@@ -32,8 +32,8 @@ from manip_il.errors import ManipError, MismatchError, NothingToLearnError
 from manip_il.mdp import F64, Episode, State
 from manip_il.option import NameOrPath
 from manip_il.sim.config import CameraConfig
-from manip_il.worlds.config import EnvConfig, stored_config
-from manip_il.worlds.table import described_env, env_fingerprint, env_spec, make_env, make_expert
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import described_env, env_fingerprint, env_spec, make_env, make_expert, stored_config
 
 Columns = dict[str, NDArray[Any]]
 _COMPARED = ("model_sha256", "mujoco")  # entries of a fingerprint that affect restored states

@@ -24,8 +24,8 @@ from manip_il.sim.env import ManipEnv, environment_state_names
 from manip_il.tasks import ENV_IDS, TASK_IDS
 from manip_il.tasks.table import get_task
 from manip_il.worlds.config import EnvConfig as SimConfig
-from manip_il.worlds.config import complete
 from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.table import complete
 
 TASKS = {env_id.removeprefix("manip_il/"): names for env_id, names in ENV_IDS.items()}
 ANY_ROBOTS = {env_id.removeprefix("manip_il/"): task for env_id, task in TASK_IDS.items()}

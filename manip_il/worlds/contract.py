@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,8 @@ from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, require_cameras
 from manip_il.sim.props import VERSION as DRAWN
+from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.fingerprint import canonical_json
-
-if TYPE_CHECKING:
-    from manip_il.worlds.config import EnvConfig
 
 OPENINGS = "joint position targets [rad], gripper opening command [m]"
 SERVOS = "joint position targets [deg], gripper position command [0 to 100]"  # as in LeRobot's recorder

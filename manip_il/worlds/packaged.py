@@ -15,10 +15,10 @@ from manip_il.mdp import F64, State
 from manip_il.robots.spec import model_bytes
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
-from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.config import WORLDS, EnvConfig
 from manip_il.worlds.contract import Ability, Environment, EnvironmentSpec, Expert, Outcome, WorldKind
 from manip_il.worlds.fingerprint import environment_fingerprint
-from manip_il.worlds.table import WORLDS, described_env
+from manip_il.worlds.table import described_env
 
 WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 

@@ -9,48 +9,93 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from manip_il.caching import cached_per_thread
-from manip_il.option import NameOrPath
-from manip_il.sim.config import CameraConfig
+from manip_il.errors import UsageError
+from manip_il.option import NameOrPath, check_bounds, make_options, typed
+from manip_il.sim.config import MOST_HZ, CameraConfig
+from manip_il.worlds.config import WORLDS, EnvConfig
 
 if TYPE_CHECKING:
     from manip_il.sim.conditions import Condition
-    from manip_il.worlds.config import EnvConfig
     from manip_il.worlds.contract import Environment, EnvironmentSpec, Expert, WorldKind
 
 _KEPT = 4  # environments and experts kept for each thread: the finest scenes take 64 MB
 
 
-class Listed(NamedTuple):
-    """What help says of a world, and the module whose `WORLD` makes it."""
-
-    module: str
-    about: str
-    tasks: tuple[str, ...]
-    cameras: tuple[str, ...] = ()
-
-
-WORLDS: dict[NameOrPath, Listed] = {
-    "fetch_stock": Listed(
-        "manip_il.worlds.fetch.expert",
-        "gymnasium-robotics' Fetch",
-        ("FetchReach-v4", "FetchPush-v4", "FetchPickAndPlace-v4"),
-    ),
-    "aloha": Listed(
-        "manip_il.worlds.aloha.expert",
-        "gym_aloha's two arms",
-        ("AlohaTransferCube-v0", "AlohaInsertion-v0"),
-        ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist"),
-    ),
-}
 _OURS = "manip_il.worlds.ladder.world"  # of every other robot
 
 
 def world_of(robot: NameOrPath) -> WorldKind:
     """Return the world of a robot."""
     return import_module(WORLDS[robot].module if robot in WORLDS else _OURS).WORLD
+
+
+def make_config(
+    robot: NameOrPath = EnvConfig.robot,
+    task: NameOrPath = EnvConfig.task,
+    control_hz: int = 0,
+    **settings: Any,
+) -> EnvConfig:
+    """Return the settings of an environment; what is not given comes from its robot and task.
+
+    This function is for what a person wrote: names that end in `.py` or `.yaml` and objects `mesh:FILE` are paths. What
+    is stored goes to `complete`, where a `str` is a name.
+
+    Args:
+        robot: Its name, or the path of its YAML.
+        task: Its name, or the path of its Python file.
+        control_hz: Control steps per second; 0 for the robot's own.
+        settings: Other fields of `EnvConfig`.
+
+    Raises:
+        UnknownName: for a robot or a task.
+        UsageError: for a wrong value.
+    """
+    settings |= {"robot": typed(robot), "task": typed(task), "object": typed(settings.get("object", ""))}
+    return complete(make_options(EnvConfig, control_hz=control_hz, **settings))
+
+
+def stored_config(
+    spec: Any, robot: NameOrPath | None = None, task: NameOrPath | None = None, shape: NameOrPath | None = None
+) -> EnvConfig:
+    """Return the settings of the environment that a dataset or a policy names; what it names is never a path.
+
+    Args:
+        spec: A `RobotTaskSpec` or an `Origin`.
+        robot: What the user gave, which replaces the name in `spec`; the same for the task.
+        task: See `robot`.
+        shape: See `robot`; the object.
+
+    Raises:
+        UsageError: if something that is not built in was not given, and whatever else `make_config` raises.
+    """
+    named = {"robot": robot or spec.robot, "task": task or spec.task, "object": shape or spec.object}
+    return complete(replace(EnvConfig(spec.fps), **named))
+
+
+def complete(config: EnvConfig) -> EnvConfig:
+    """Return settings with 0 and empty values filled in from robot and task; raises what `make_config` raises."""
+    from manip_il.mdp import LONGEST_EPISODE  # imported here: help needs no numpy
+
+    if isinstance(config.control_hz, float):
+        raise UsageError(
+            f"control_hz is {config.control_hz}; expected a whole number, as environments are simulated at one"
+        )
+    check_bounds(config)
+    config = world_of(config.robot).complete(config)
+    if not 1 <= config.control_hz <= MOST_HZ:
+        raise UsageError(f"control_hz is {config.control_hz}; expected 1 to {MOST_HZ}")
+    if not 0 < config.tolerance < 1:
+        raise UsageError(f"tolerance is {config.tolerance} m; expected between 0 and 1")
+    if config.horizon > LONGEST_EPISODE:
+        raise UsageError(f"horizon is {config.horizon}; expected at most {LONGEST_EPISODE} control steps")
+    if config.success_steps < 1 or config.horizon < config.success_steps:
+        raise UsageError(
+            f"horizon is {config.horizon}, success_steps {config.success_steps}; expected horizon >= success_steps >= 1"
+        )
+    return config
 
 
 def make_env(

@@ -18,7 +18,7 @@ from manip_il.chapter.ppo import ppo
 from manip_il.cli.main import main
 from manip_il.collect.workers import Engine
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.worlds.config import make_config
+from manip_il.worlds.table import make_config
 
 from ..collect.clones import clone
 from ..damage import digests

@@ -17,8 +17,8 @@ from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.mdp import Episode
-from manip_il.worlds.config import EnvConfig, make_config
-from manip_il.worlds.table import env_fingerprint, env_spec
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint

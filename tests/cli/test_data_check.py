@@ -12,8 +12,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.build import build
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal
-from manip_il.worlds.config import make_config
-from manip_il.worlds.table import env_fingerprint, env_spec
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..damage import edit_json
 from .made_runs import make_episode

@@ -13,8 +13,7 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import ManipEnv
-from manip_il.worlds.config import make_config
-from manip_il.worlds.table import env_fingerprint, env_spec
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..damage import edit_json
 from ..learn.tiny_policies import edit_config, write_checkpoint

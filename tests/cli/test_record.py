@@ -16,8 +16,7 @@ from manip_il.data.journal import list_episodes
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.sim import render
 from manip_il.sim.config import Look
-from manip_il.worlds.config import make_config
-from manip_il.worlds.table import env_fingerprint, env_spec
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..pictures import read_episodes
 from .made_runs import files

@@ -16,7 +16,7 @@ from manip_il.data import schema
 from manip_il.evaluation.watch import FRAME, slider_actions
 from manip_il.mdp import Episode
 from manip_il.sim.config import CAMERAS
-from manip_il.worlds.config import make_config
+from manip_il.worlds.table import make_config
 
 from ..scenes import started
 

@@ -36,9 +36,9 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.variation import part
 from manip_il.sim.world import World
-from manip_il.worlds.config import EnvConfig, make_config
+from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.ladder.envs import env_of, scene_of
-from manip_il.worlds.table import env_fingerprint, env_spec, make_expert
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config, make_expert
 
 from ..damage import digests
 from ..pictures import read_episodes

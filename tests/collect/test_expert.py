@@ -18,8 +18,8 @@ from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.world import GOAL, Scene, World
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import get_task
-from manip_il.worlds.config import make_config
 from manip_il.worlds.ladder.envs import env_of, scene_of
+from manip_il.worlds.table import make_config
 
 from ..scenes import sizes_of, started
 from ..tables import every_robot, every_scene, every_scene_with_a_cube

@@ -18,7 +18,7 @@ from manip_il.data.journal import Journal, list_episodes, list_seeds
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.sim.config import CameraConfig
-from manip_il.worlds.config import make_config
+from manip_il.worlds.table import make_config
 
 from ..damage import digests
 

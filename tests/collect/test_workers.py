@@ -26,7 +26,7 @@ from manip_il.collect.workers import Engine, map_in_order
 from manip_il.data.journal import list_seeds
 from manip_il.errors import ManipError
 from manip_il.seeding import stream_seeds
-from manip_il.worlds.config import make_config
+from manip_il.worlds.table import make_config
 
 from ..faults.child import living
 

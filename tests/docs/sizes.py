@@ -10,7 +10,7 @@ import yaml
 
 from manip_il.cli.main import load
 from manip_il.cli.options import options_of
-from manip_il.worlds.table import WORLDS
+from manip_il.worlds.config import WORLDS
 
 from .pages import command_of
 

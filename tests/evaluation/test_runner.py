@@ -16,8 +16,7 @@ from manip_il.evaluation.runner import evaluate
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL, turn_of
-from manip_il.worlds.config import make_config
-from manip_il.worlds.table import env_spec
+from manip_il.worlds.table import env_spec, make_config
 
 from ..collect.clones import clone
 from ..learn.tiny_policies import write_checkpoint

@@ -13,9 +13,8 @@ from manip_il.robots import ROBOTS
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
-from manip_il.worlds.config import make_config
 from manip_il.worlds.ladder.envs import scene_of
-from manip_il.worlds.table import described_env, env_spec
+from manip_il.worlds.table import described_env, env_spec, make_config
 
 from ..scenes import started
 from ..so_follower import Camera, arm, recorders_features

@@ -26,9 +26,8 @@ from manip_il.sim.world import GOAL, World
 from manip_il.tasks import NAMES
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS, get_task
-from manip_il.worlds.config import make_config
 from manip_il.worlds.ladder.envs import make_env, scene_of
-from manip_il.worlds.table import env_fingerprint, env_spec
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..scenes import has_goal, sizes_of, started, still
 from ..tables import SCENES, WITH_A_CUBE, every_scene, every_task

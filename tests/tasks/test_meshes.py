@@ -23,9 +23,8 @@ from manip_il.sim.rests import LEAST_ROOM
 from manip_il.sim.shape import DENSITY, LIGHTEST, Shape
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
-from manip_il.worlds.config import make_config, stored_config
 from manip_il.worlds.ladder.envs import make_env, scene_of
-from manip_il.worlds.table import env_fingerprint, env_spec, world_of
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config, stored_config, world_of
 from tests.meshes import MESHES, write_mesh
 
 OBJECT = "object"

@@ -22,9 +22,8 @@ from manip_il.robots import table as robots
 from manip_il.sim.points import point_names
 from manip_il.tasks import table
 from manip_il.tasks.table import get_task
-from manip_il.worlds.config import make_config
 from manip_il.worlds.ladder.envs import scene_of
-from manip_il.worlds.table import env_fingerprint, env_spec, world_of
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config, world_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "new-task.md"
 TOUCH, RAISE = (block.split("```", 1)[0] for block in PAGE.read_text().split("```python\n")[1:])

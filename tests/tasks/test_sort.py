@@ -18,8 +18,8 @@ from manip_il.sim.world import World
 from manip_il.tasks.sort import BINS, COLOURS, PITCH, SENTENCES, asked
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
-from manip_il.worlds.config import make_config
 from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.table import make_config
 
 from ..scenes import SEED, drive_until, started
 from ..tables import every_large_robot

@@ -20,8 +20,8 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.aloha import environment
 from manip_il.worlds.aloha.environment import INSTALL, AlohaEnv
-from manip_il.worlds.config import EnvConfig, make_config
-from manip_il.worlds.table import WORLDS, env_spec, make_env, make_expert
+from manip_il.worlds.config import WORLDS, EnvConfig
+from manip_il.worlds.table import env_spec, make_config, make_env, make_expert
 
 ALOHA = AlohaEnv.robot
 TRANSFER, INSERTION = WORLDS[ALOHA].tasks

@@ -14,10 +14,10 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
-from manip_il.worlds.config import EnvConfig, make_config
+from manip_il.worlds.config import WORLDS, EnvConfig
 from manip_il.worlds.fetch.environment import FETCH_TASKS, FetchEnv
 from manip_il.worlds.fetch.expert import FetchExpert
-from manip_il.worlds.table import WORLDS, env_spec
+from manip_il.worlds.table import env_spec, make_config
 
 every_task = pytest.mark.parametrize("task", WORLDS[FetchEnv.robot].tasks)
 

@@ -21,8 +21,8 @@ from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.sources import check_same_sources
 from manip_il.sim.config import CameraConfig
-from manip_il.worlds.config import EnvConfig, complete, stored_config
-from manip_il.worlds.table import env_fingerprint, env_spec, world_of
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import complete, env_fingerprint, env_spec, stored_config, world_of
 
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 

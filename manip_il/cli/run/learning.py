@@ -18,8 +18,7 @@ from manip_il.data.schema import RobotTaskSpec
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.rounds import METRICS_FILE
 from manip_il.learn.checkpoint import Origin
-from manip_il.worlds.config import stored_config
-from manip_il.worlds.table import env_spec
+from manip_il.worlds.table import env_spec, stored_config
 
 
 def _run(options: Learning, config: LearningConfig) -> None:

@@ -14,7 +14,8 @@ from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import Scene, build_scene
 from manip_il.sim.task import Task
 from manip_il.tasks.table import get_task
-from manip_il.worlds.config import EnvConfig, make_config
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import make_config
 
 
 def scene_of(robot: NameOrPath, task: NameOrPath, shape: NameOrPath = "") -> Scene:
