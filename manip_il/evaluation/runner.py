@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,6 @@ from manip_il.sim.world import World
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import described_env, env_fingerprint, env_spec
 
-_LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps for which an episode continues after success, to see whether success lasts
 CHECK_EVERY = 100  # number of episodes between checks of the interval's width
 EPISODES_FILE = "episodes.jsonl"
@@ -68,7 +66,7 @@ def evaluate(
 
     suite: name of the job's conditions. done: seed -> result of an earlier run. until_width: stop once the width of the
     interval is at most this; checked after every `CHECK_EVERY` seeds in order, independently of the workers. on_result:
-    called with every result as its episode ends. A seed that repeatedly kills its worker is skipped with a warning.
+    called with every result as its episode ends.
     """
     results: dict[int, EpisodeResult] = {}
     known = done or {}
@@ -82,9 +80,6 @@ def evaluate(
             low, high = Proportion.of([one.success for one in results.values()], sequential=True).interval
             if high - low <= until_width:
                 break
-    run = [seed for seed in seeds if seed <= max(results, default=-1)] if until_width else seeds
-    if lost := [seed for seed in run if seed not in results]:
-        _LOG.warning("left out of the evaluation, as each repeatedly killed its worker: seeds %s", lost)
     spec = env_spec(job.env)
     return EvalResult(
         policy=name,

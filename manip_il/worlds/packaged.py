@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from typing import Any, ClassVar, NamedTuple, cast, override
 
 import mujoco
@@ -21,6 +21,7 @@ from manip_il.worlds.fingerprint import environment_fingerprint
 from manip_il.worlds.table import described_env
 
 WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+TOLERANCE = 0.05  # Fetch's; another environment that reports success by itself ignores it [m]
 
 
 class PackagedRung(NamedTuple):
@@ -55,6 +56,9 @@ class PackagedEnv(Environment):
     data: mujoco.MjData
     _env: Any
 
+    def __init__(self, task: str, cameras: CameraConfig | None = None):
+        raise NotImplementedError
+
     @property
     @override
     def spec(self) -> EnvironmentSpec:
@@ -84,7 +88,7 @@ class PackagedEnv(Environment):
     @override
     def start(self, seed: int) -> None:
         self._env.reset(seed=seed)
-        self._step, self._streak, self._ever = 0, 0, False
+        self._count_from(0, 0, False)
 
     @override
     def step(self, action: NDArray[Any]) -> Outcome:
@@ -109,51 +113,51 @@ class PackagedEnv(Environment):
         """Restore the counts, if the state's physics has this many numbers; raise `MismatchError` if not."""
         if len(state.physics) != size:
             raise MismatchError("size of the state", "the state", len(state.physics), self.task.name, size)
-        self._step, self._streak, self._ever = state.step, state.streak, state.ever
+        self._count_from(state.step, state.streak, state.ever)
+
+    def _count_from(self, step: int, streak: int, ever: bool) -> None:
+        self._step = step
+        self._streak = streak
+        self._ever = ever
 
 
-@dataclass(frozen=True)
 class Packaged(WorldKind):
-    """The environments of another package. make, teach: return the environment and the expert of a task.
+    """The environments of another package. cls: of its environments; teach: returns the expert of a task."""
 
-    fixed: settings that cannot change; horizon: the default, if it is none of them.
-    """
-
-    make: Callable[[str, CameraConfig | None], PackagedEnv]
-    teach: Callable[[str], Expert]
-    robot: str
-    fixed: Mapping[str, float]
-    horizon: int = 0
+    def __init__(self, cls: type[PackagedEnv], teach: Callable[[str], Expert]):
+        self._cls, self._teach = cls, teach
+        self._tasks = WORLDS[cls.robot].tasks
 
     @override
     def complete(self, config: EnvConfig) -> EnvConfig:
-        tasks = WORLDS[self.robot].tasks
-        if config.task not in tasks:
-            raise UnknownName(f"task of {self.robot}", str(config.task), tasks)
+        robot = self._cls.robot
+        if config.task not in self._tasks:
+            raise UnknownName(f"task of {robot}", str(config.task), self._tasks)
         if config.object:
-            raise UsageError(f"object is {config.object}; {self.robot} is unmodified, so omit --task.object")
-        for name, value in self.fixed.items():
+            raise UsageError(f"object is {config.object}; {robot} is unmodified, so omit --task.object")
+        fixed = {"control_hz": self._cls.control_hz, "tolerance": TOLERANCE, "success_steps": 1}
+        for name, value in fixed.items():
             given = getattr(config, name)
             if given not in (0, value):
-                raise UsageError(f"{name} is {given:g}; {self.robot} is unmodified, expected {value:g}")
-        settings: dict[str, Any] = {"horizon": config.horizon or self.horizon, **self.fixed}
+                raise UsageError(f"{name} is {given:g}; {robot} is unmodified, expected {value:g}")
+        settings: dict[str, Any] = {"horizon": config.horizon or self._cls.horizon, **fixed}
         return replace(config, **settings)
 
     @override
     def environment(
         self, config: EnvConfig, cameras: CameraConfig | None, conditions: Sequence[Condition]
     ) -> PackagedEnv:
-        env = self.make(str(config.task), cameras)
+        env = self._cls(str(config.task), cameras)
         env.horizon = config.horizon
         return env
 
     @override
     def expert(self, config: EnvConfig) -> Expert:
-        return self.teach(str(config.task))
+        return self._teach(str(config.task))
 
     @override
     def own_files(self, robot: str, task: str, shape: str) -> list[str]:
-        return [] if task in WORLDS[robot].tasks else [f"--task.type={'|'.join(WORLDS[robot].tasks)}"]
+        return [] if task in self._tasks else [f"--task.type={'|'.join(self._tasks)}"]
 
     @override
     def fingerprint(self, config: EnvConfig) -> dict[str, str]:

@@ -145,10 +145,4 @@ class _Aloha(Packaged):
         return ["--env.type=aloha", f"--env.task={task}"]
 
 
-WORLD = _Aloha(
-    AlohaEnv,
-    AlohaExpert,
-    AlohaEnv.robot,
-    {"control_hz": AlohaEnv.control_hz, "tolerance": 0.05, "success_steps": 1},  # the reward shows when it is solved
-    AlohaEnv.horizon,
-)
+WORLD = _Aloha(AlohaEnv, AlohaExpert)

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from manip_il.mdp import F64, Observation, State
 from manip_il.robots.action_space import ActionSpace
+from manip_il.sim.config import CameraConfig
 from manip_il.worlds.contract import Outcome
-from manip_il.worlds.packaged import WHOLE, PackagedEnv, coordinates
+from manip_il.worlds.packaged import TOLERANCE, WHOLE, PackagedEnv, coordinates
 
-TOLERANCE = 0.05  # distance to the goal within which the reward is 0, else -1 [m]
 STATE_NAMES = ("gripper.x", "gripper.y", "gripper.z", "gripper.opening")
 
 
@@ -61,7 +61,7 @@ class FetchEnv(PackagedEnv):
     control_hz, horizon = 25, 50
     actions = ACTIONS
 
-    def __init__(self, task: str):
+    def __init__(self, task: str, cameras: CameraConfig | None = None):
         self.task = FETCH_TASKS[task]
         with contextlib.redirect_stderr(io.StringIO()):  # gymnasium-robotics announces its versions there
             import_module("gymnasium_robotics")  # which registers its names

@@ -14,7 +14,7 @@ import numpy as np
 
 from manip_il.mdp import F64, Label, State
 from manip_il.worlds.contract import Environment, Expert
-from manip_il.worlds.fetch.environment import TOLERANCE, FetchEnv
+from manip_il.worlds.fetch.environment import FetchEnv
 from manip_il.worlds.packaged import Packaged, PackagedRung, always
 
 REACH = 0.032  # displacement of the gripper in one control step at an action of 1 [m]
@@ -226,9 +226,4 @@ class FetchExpert(Expert):
         return Label(np.append(np.clip(way / REACH, -1, 1), fingers), phase, True, 0.0)
 
 
-WORLD = Packaged(
-    lambda task, cameras: FetchEnv(task),
-    FetchExpert,
-    FetchEnv.robot,
-    {"control_hz": FetchEnv.control_hz, "tolerance": TOLERANCE, "success_steps": 1, "horizon": FetchEnv.horizon},
-)
+WORLD = Packaged(FetchEnv, FetchExpert)
