@@ -98,7 +98,9 @@ class Pictured:
 
     def camera_config(self, env: EnvConfig, look: Look | None = None) -> CameraConfig:
         """Return the cameras, by default those of `default_cameras`; `UsageError` for an invalid value."""
-        return CameraConfig(tuple(self.cameras) or default_cameras(env), **self.image, look=look or Look())
+        cameras = CameraConfig(tuple(self.cameras) or default_cameras(env), **self.image, look=look or Look())
+        env_spec(env).require_cameras(cameras)
+        return cameras
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,7 +34,6 @@ class Episodes:
 
 
 CAMERAS = ("front", "side", "wrist")
-OTHERS = ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist")  # of gym-aloha
 MIN_SIDE, MAX_SIDE = 16, 2048  # sides of a picture [pixels]
 _BRIGHTNESS = (0.1, 2.0)
 
@@ -67,7 +66,7 @@ FILM = Look(shadows=True)  # for people: shadows show how high things are
 class CameraConfig:
     """Cameras that take a picture at every step, and the height, width [pixels] and look of their pictures.
 
-    Raises `UnknownName` for an unknown camera, `UsageError` if no camera is named or one is named twice, or if a height
+    Raises `UsageError` if no camera is named or one is named twice, or if a height
     or width is odd (which 4:2:0 video does not allow) or out of range.
     """
 
@@ -77,9 +76,6 @@ class CameraConfig:
     look: Look = field(default_factory=Look)
 
     def __post_init__(self) -> None:
-        for name in self.names:
-            if name not in (*CAMERAS, *OTHERS):
-                raise UnknownName("camera", name, CAMERAS)
         if not self.names or len(set(self.names)) < len(self.names):
             raise UsageError(f"cameras are {', '.join(self.names) or 'none'}; expected at least one, each named once")
         if any(side % 2 or not MIN_SIDE <= side <= MAX_SIDE for side in self.size):

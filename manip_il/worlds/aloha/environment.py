@@ -17,12 +17,15 @@ from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import REMEDY
 from manip_il.sim.view import simplify_meshes
-from manip_il.worlds.aloha.ladder import AlohaScene, read_hand
-from manip_il.worlds.aloha.tasks import ALOHA_NAMES, ALOHA_TASKS
+from manip_il.worlds.aloha import insertion, transfer
+from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, read_hand
 from manip_il.worlds.contract import GRIPPERS as GRIPPERS_OF
 from manip_il.worlds.contract import TWO_ARMS
 from manip_il.worlds.packaged import WHOLE, PackagedEnv, coordinates
 
+ALOHA_TASKS = {one.TASK.name: one.TASK for one in (transfer, insertion)}
+_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
+ALOHA_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)  # as in `lerobot/aloha_sim_*`
 INSTALL = "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10 lxml==6.1.3"
 MOST_REWARD = 4
 GRIPPERS = np.array(GRIPPERS_OF[TWO_ARMS])
@@ -77,9 +80,9 @@ class AlohaEnv(PackagedEnv):
         """Reward of the state as a share of the environment's highest reward."""
         return float(self._env._env.task.get_reward(self.physics)) / MOST_REWARD
 
-    def scene(self, kind: type[AlohaScene] = AlohaScene) -> AlohaScene:
+    def scene(self) -> AlohaScene:
         """Return the scene read from the state."""
-        return kind(self.task, self.model, self.data)
+        return self.task.scene(self.task, self.model, self.data)
 
     def measured(self) -> F64:
         """Return joint positions [rad] and gripper openings, 0 to 1, (14,)."""

@@ -13,7 +13,9 @@ from manip_il.worlds.aloha.ladder import (
     ARM,
     PITCH,
     AlohaScene,
+    AlohaTask,
     HandTarget,
+    Held,
     Thing,
     Z,
     cross,
@@ -94,7 +96,7 @@ def _insert(scene: Insertion) -> HandTarget:
     return move_object(scene, "right", PEG, socket.position + scene.depth * frame[:, 0], frame, INSERTED)
 
 
-RUNGS = {
+_RUNGS = {
     "left": (_carry("left", MEETING), *take_rungs("left", SOCKET, lambda one: one.grasps["left"])),
     "right": (
         PackagedRung("insert", lambda one: one.has["right"] and one.ready and one.depth < BEFORE, _insert),
@@ -103,3 +105,13 @@ RUNGS = {
         *take_rungs("right", PEG, lambda one: one.grasps["right"]),
     ),
 }
+TASK = AlohaTask(
+    "AlohaInsertion-v0",
+    "Insert the peg into the socket.",
+    "insertion",
+    {PEG: Held(0.018, 0.0075, long=True), SOCKET: Held(0.026, 0.019, long=True)},
+    {PEG: "right", SOCKET: "left"},
+    Insertion,
+    _RUNGS,
+    (PEG, SOCKET),
+)

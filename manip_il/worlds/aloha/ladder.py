@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -13,9 +13,9 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_between, turned_towards
-from manip_il.worlds.aloha.tasks import SIDES, AlohaTask, Held
 from manip_il.worlds.packaged import PackagedRung, always
 
+SIDES = ("left", "right")
 FINGER_AT_TOUCH = 0.0224  # position of a finger joint at which the fingers would touch [m]
 GRASP_AHEAD = -0.002  # offset of a held object from the hand's site along the fingers [m]
 AROUND = (0.010, 0.012, 0.010)  # largest offset from that place to begin closing, in the hand's axes [m]
@@ -35,6 +35,18 @@ OPENING_STANDOFF = 0.045  # distance from an object while the fingers are not op
 OPENING_SPAN = 0.004  # range of half the gap over which that distance falls to 0 [m]
 BACK_FIRST = 0.03  # a hand that is this much too near retreats before it moves sideways [m]
 MOST_TURN = 0.3  # largest turn of an object in a step [rad]
+
+
+@dataclass(frozen=True)
+class Held:
+    """Half gaps between the fingers for one object [m]. open: smallest that clears it; thin: smallest that holds it.
+
+    long: whether the object is longest along its own x axis.
+    """
+
+    open: float
+    thin: float
+    long: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,6 +88,30 @@ class Thing:
             up = nearest(self.axes, Z)
             ahead = nearest(self.axes[:, np.abs(self.axes.T @ up) < 0.5], X)
         return np.stack([ahead, cross(up, ahead), up], axis=1)
+
+
+@dataclass(frozen=True)
+class AlohaTask:
+    """One task of `gym_aloha`. own: its name there. grasped: the hand that takes each object.
+
+    scene: the facts that its rungs read; rungs: those of each hand, latest first. inserted: an object, and the object
+    that it goes into; empty if nothing is inserted.
+    """
+
+    name: str
+    instruction: str
+    own: str
+    objects: Mapping[str, Held]
+    grasped: Mapping[str, str]
+    scene: type[AlohaScene]
+    rungs: Mapping[str, tuple[PackagedRung, ...]]
+    inserted: tuple[str, ...] = ()
+
+    @property
+    def phases(self) -> tuple[str, ...]:
+        """`none`, then `LEFT, RIGHT` for every pair of the two hands' rungs, earliest first."""
+        left, right = (self.rungs[side][::-1] for side in SIDES)
+        return ("none", *(f"{one.name}, {other.name}" for one in left for other in right))
 
 
 class AlohaScene:

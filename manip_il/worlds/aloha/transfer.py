@@ -14,7 +14,9 @@ from manip_il.worlds.aloha.ladder import (
     OPEN,
     PITCH,
     AlohaScene,
+    AlohaTask,
     HandTarget,
+    Held,
     X,
     Z,
     ahead_across,
@@ -108,7 +110,7 @@ def _wait(scene: Transfer) -> HandTarget:
     return HandTarget(MEETING + WAITING, ahead_across(X, Z), OPEN, FAST)
 
 
-RUNGS = {
+_RUNGS = {
     "left": (
         PackagedRung(
             "hold", lambda one: one.left_holds, lambda one: HandTarget(one.left.position, one.left.rotation, CLOSED)
@@ -127,3 +129,12 @@ RUNGS = {
         *take_rungs("right", CUBE, lambda one: one.right_grasp),
     ),
 }
+TASK = AlohaTask(
+    "AlohaTransferCube-v0",
+    "Pick up the cube with the right arm and transfer it to the left arm.",
+    "transfer_cube",
+    {CUBE: Held(0.027, 0.017)},
+    {CUBE: "right"},
+    Transfer,
+    _RUNGS,
+)
