@@ -9,18 +9,25 @@ from manip_il.option import option
 
 DT_SIM = 0.002  # longest physics step [s]
 MOST_HZ = round(1 / DT_SIM)
+LONGEST_EPISODE = 10_000  # [control steps]; eight minutes at 20 Hz
 
 
 @dataclass(frozen=True)
 class Episodes:
     """Timing, success criterion and length of episodes. 0 means the robot's or task's own value."""
 
-    control_hz: int = option(0, "control steps per second; 0: the robot's own (so101: 30, others: 20)")
-    tolerance: float = option(0.0, "distance to the goal that counts as success [m]; 0: the task's own")
-    success_steps: int = option(
-        0, "consecutive control steps within the tolerance that count as success; 0: the task's own"
+    control_hz: int = option(
+        0, "control steps per second; 0: the robot's own (so101: 30, others: 20)", at_least=0, at_most=MOST_HZ
     )
-    horizon: int = option(0, "length of an episode [control steps]; 0: the task's own")
+    tolerance: float = option(
+        0.0, "distance to the goal that counts as success [m]; 0: the task's own", at_least=0, at_most=1
+    )
+    success_steps: int = option(
+        0, "consecutive control steps within the tolerance that count as success; 0: the task's own", at_least=0
+    )
+    horizon: int = option(
+        0, "length of an episode [control steps]; 0: the task's own", at_least=0, at_most=LONGEST_EPISODE
+    )
 
     @property
     def physics_steps(self) -> int:

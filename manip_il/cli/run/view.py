@@ -16,9 +16,8 @@ from manip_il.errors import UsageError
 from manip_il.evaluation.runner import HOLD
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.evaluation.watch import RerunLog, WindowScreen, outcome
-from manip_il.mdp import LONGEST_EPISODE
 from manip_il.seeding import BLOCK, stream_seeds
-from manip_il.sim.config import FILM, CameraConfig, Look
+from manip_il.sim.config import FILM, LONGEST_EPISODE, CameraConfig, Look
 from manip_il.sim.window import has_display
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import env_spec, make_env
