@@ -16,7 +16,8 @@ from manip_il.data import schema
 from manip_il.evaluation.watch import FRAME, slider_actions
 from manip_il.mdp import Episode
 from manip_il.sim.config import CAMERAS
-from manip_il.worlds.table import make_config, make_env
+from manip_il.worlds.ladder.world import LadderEnv
+from manip_il.worlds.table import make_config
 
 REACH = ["view", "--task.type=reach"]
 SCALARS, TEXT = "Scalars:scalars", "TextLog:text"
@@ -79,7 +80,7 @@ def test_the_sliders_of_the_window_drive_from_where_an_episode_starts():
         commands = np.zeros(0)
 
     config = make_config("panda", "reach", horizon=30)
-    env, window = make_env(config), Window()
+    env, window = LadderEnv(config, None, ()), Window()
     env.start(3_000_000)
     scene, start = env.scene, env.data.ctrl.copy()
     job = RolloutJob(config)
