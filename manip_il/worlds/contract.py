@@ -19,7 +19,6 @@ from manip_il.mdp import F64, IMAGES, KEYPOINTS, Label, Observation, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, require_cameras
-from manip_il.sim.props import VERSION as DRAWN
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.fingerprint import canonical_json
 
@@ -235,7 +234,7 @@ class WorldKind:
 
     def drawing_version(self, config: EnvConfig) -> int:
         """Return a number that changes when pictures do."""
-        return DRAWN
+        raise NotImplementedError
 
     def own_files(self, robot: str, task: str, shape: str) -> list[str]:
         """Return the options, with FILE for a path, that name what is not built in; [] if everything is."""

@@ -15,6 +15,7 @@ from manip_il.mdp import F64, State
 from manip_il.robots.spec import model_bytes
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
+from manip_il.sim.props import VERSION as DRAWN
 from manip_il.worlds.config import WORLDS, EnvConfig
 from manip_il.worlds.contract import Ability, Environment, EnvironmentSpec, Expert, Outcome, WorldKind
 from manip_il.worlds.fingerprint import environment_fingerprint
@@ -154,6 +155,10 @@ class Packaged(WorldKind):
     @override
     def expert(self, config: EnvConfig) -> Expert:
         return self._teach(str(config.task))
+
+    @override
+    def drawing_version(self, config: EnvConfig) -> int:
+        return DRAWN
 
     @override
     def own_files(self, robot: str, task: str, shape: str) -> list[str]:
