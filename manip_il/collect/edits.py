@@ -6,7 +6,7 @@ appears when it is complete.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -27,9 +27,8 @@ from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.info import Info
 from manip_il.data.lerobot_layout import OURS, Features
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError
-from manip_il.mdp import F64, Episode, State
+from manip_il.mdp import F64, Episode, Label, State
 from manip_il.option import NameOrPath
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.config import EnvConfig
@@ -159,9 +158,19 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
     provenance = {"redrawn": {**_origin(source), **drawn, **vary}, **tried}
     spec = replace(spec, video=False)  # frames are independent scenes
     fingerprint = env_fingerprint(source.env, scenes.cameras)
-    work = partial(_draw_scenes, source.env, scenes)
     pieces = scenes.chunks(columns[schema.SIM_STATE], _leads(source, columns))
-    return _write(target, spec, fingerprint, provenance, work, pieces)
+
+    def episodes() -> Iterator[Episode]:
+        empty = True
+        for _, found in made:
+            yield from found
+            empty = empty and not found
+            target.on_piece()
+        if empty:
+            raise NothingToLearnError("no scene has a valid expert label, so there is nothing to learn from")
+
+    with closing(map_in_order(partial(_draw_scenes, source.env, scenes), pieces, target.workers)) as made:
+        return write_dataset(episodes(), target.root, spec, provenance, replace=target.replace, fingerprint=fingerprint)
 
 
 def _rewrite(
@@ -180,41 +189,22 @@ def _rewrite(
         return rewrite_columns(source.dataset, target.root, columns(), own, features, replace=target.replace)
 
 
-def _write[T](
-    target: EditTarget,
-    spec: RobotTaskSpec,
-    fingerprint: Mapping[str, Any],
-    provenance: Mapping[str, Any],
-    work: Callable[[T], list[Episode]],
-    pieces: Iterable[T],
-) -> Info:
-    """Write the episodes that workers make from each piece, in order."""
-
-    def episodes() -> Iterator[Episode]:
-        empty = True
-        for _, found in made:
-            yield from found
-            empty = empty and not found
-            target.on_piece()
-        if empty:
-            raise NothingToLearnError("no scene has a valid expert label, so there is nothing to learn from")
-
-    with closing(map_in_order(work, pieces, target.workers)) as made:
-        return write_dataset(episodes(), target.root, spec, provenance, replace=target.replace, fingerprint=fingerprint)
-
-
 def label_states(env: EnvConfig, states: NDArray[Any]) -> Columns:
     """Return the expert's labels of states, rows of `sim_state` (T, m), as columns of a dataset, (T,) or (T, n).
 
     If a label is invalid, its action holds the arm still and `label_valid` is 0.
     """
-    expert = make_expert(env)
-    labels = [expert.label(State.from_vector(state)) for state in states]
+    labels = _labels(env, states)
     return {
         schema.ACTION: np.stack([label.action for label in labels]).astype(np.float32),
         schema.LABEL_VALID: np.array([label.valid for label in labels], np.int64),
         schema.EXPERT_PHASE: np.array([label.phase for label in labels], np.int64),
     }
+
+
+def _labels(env: EnvConfig, states: NDArray[Any]) -> list[Label]:
+    expert = make_expert(env)
+    return [expert.label(State.from_vector(state)) for state in states]
 
 
 def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -> Columns:
@@ -248,9 +238,7 @@ def _leads(source: EditSource, columns: Columns) -> F64:
     action = columns[schema.ACTION].astype(np.float64)
     if not _is_served(source.dataset.provenance):
         return np.zeros_like(action)
-    expert = make_expert(source.env)
-    labels = [expert.label(State.from_vector(state)) for state in columns[schema.SIM_STATE]]
-    own = np.stack([label.action for label in labels])
+    own = np.stack([label.action for label in _labels(source.env, columns[schema.SIM_STATE])])
     return np.where(columns[schema.LABEL_VALID].reshape(-1, 1) > 0, action - own, 0.0)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,6 +62,11 @@ class RolloutJob:
         """The `pretrained_model` folder of the policy that drives."""
         return next(iter(self.driver.policies), None)
 
+    @cached_property
+    def checkpoints(self) -> tuple[Checkpoint, ...]:
+        """The driver's policies, opened."""
+        return tuple(map(Checkpoint.open, self.driver.policies))
+
     @property
     def labels_all(self) -> bool:
         """Whether every state is labelled."""
@@ -73,7 +79,10 @@ class RolloutJob:
         cameras = observed_cameras(self)
         envs = [make_env(self.env, cameras, self.conditions) for _ in range(min(self._lockstep(), len(seeds)))]
         noise = [one.only("sensing") for one in self.conditions]
-        branch_env = make_env(self.env, self.cameras, noise) if self.label == "branch" else None
+        branch_env = None
+        if self.label == "branch":
+            env_spec(self.env).require("restored", "give another --label than branch")
+            branch_env = make_env(self.env, self.cameras, noise)
         steps = run_steps(self, envs, seeds)
         for frames in group_rollouts(map(_without_pictures, steps) if self.cameras is None and cameras else steps):
             drawn = draw(self.conditions, frames[0].seed, self.env.object)
@@ -107,7 +116,7 @@ def run_steps(
     job: RolloutJob, envs: Sequence[Environment], seeds: Iterable[int], act: Act | None = None
 ) -> Iterator[Transition]:
     """Run a job's episodes in these environments and yield every step. act: replaces the job's driver."""
-    policies = tuple(_load(job, path) for path in job.driver.policies)
+    policies = tuple(_load(job, checkpoint) for checkpoint in job.checkpoints)
     setting = Setting(envs[0].actions, job.env.horizon, policies)
     rules = Rules(job.env.horizon, job.hold, job.patience, takeover=job.label == "takeover")
     gate = gate_of(job.label, job.query, setting)
@@ -119,7 +128,7 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
 
     Raises `MismatchError` if the recorded cameras do not include those of the policy.
     """
-    wanted = Checkpoint.open(job.policy).cameras if job.policy is not None else None
+    wanted = job.checkpoints[0].cameras if job.checkpoints else None
     if wanted is None or job.cameras is None:
         return job.cameras or wanted
     if not set(wanted.names) <= set(job.cameras.names) or wanted.size != job.cameras.size:
@@ -127,12 +136,11 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
     return job.cameras
 
 
-def _load(job: RolloutJob, path: Path) -> LearnedPolicy:
+def _load(job: RolloutJob, checkpoint: Checkpoint) -> LearnedPolicy:
     from manip_il.learn.policy import LearnedPolicy
 
     driver = job.driver
     trust, device = (driver.trust, driver.device) if isinstance(driver, PolicyDriver) else (False, "cpu")
-    checkpoint = Checkpoint.open(path)
     spec = env_spec(job.env, observed_cameras(job))
     checkpoint.check_fits(spec)
     return LearnedPolicy.load(checkpoint, device, spec.instruction, trust=trust)
