@@ -133,7 +133,7 @@ def _alone(side: str) -> mujoco.MjModel:
 class _Aloha(Packaged):
     @override
     def lerobot_words(self, robot: str, task: str) -> list[str]:
-        return ["--env.type=aloha", f"--env.task={task}"]
+        return ["--env.type=aloha", f"--env.task={task}", "--eval.batch_size=1"]
 
 
 WORLD = _Aloha(AlohaEnv, AlohaExpert)
