@@ -65,7 +65,7 @@ def record(env: ManipEnv, expert: Expert) -> tuple[np.ndarray, float]:
     started = time.perf_counter()
     for step in range(STEPS):
         env.observe()
-        label = expert.label(env.get_state(), env.world)
+        label = expert.label(env.get_state(), env)
         env.advance(label.action)
         controls[step] = env.data.ctrl
     return controls, time.perf_counter() - started
