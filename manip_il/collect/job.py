@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,11 +61,6 @@ class RolloutJob:
         """The `pretrained_model` folder of the policy that drives."""
         return next(iter(self.driver.policies), None)
 
-    @cached_property
-    def checkpoints(self) -> tuple[Checkpoint, ...]:
-        """The driver's policies, opened."""
-        return tuple(map(Checkpoint.open, self.driver.policies))
-
     @property
     def labels_all(self) -> bool:
         """Whether every state is labelled."""
@@ -116,7 +110,7 @@ def run_steps(
     job: RolloutJob, envs: Sequence[Environment], seeds: Iterable[int], act: Act | None = None
 ) -> Iterator[Transition]:
     """Run a job's episodes in these environments and yield every step. act: replaces the job's driver."""
-    policies = tuple(_load(job, checkpoint) for checkpoint in job.checkpoints)
+    policies = tuple(_load(job, path) for path in job.driver.policies)
     setting = Setting(envs[0].actions, job.env.horizon, policies)
     rules = Rules(job.env.horizon, job.hold, job.patience, takeover=job.label == "takeover")
     gate = gate_of(job.label, job.query, setting)
@@ -128,7 +122,7 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
 
     Raises `MismatchError` if the recorded cameras do not include those of the policy.
     """
-    wanted = job.checkpoints[0].cameras if job.checkpoints else None
+    wanted = Checkpoint.open(job.policy).cameras if job.policy is not None else None
     if wanted is None or job.cameras is None:
         return job.cameras or wanted
     if not set(wanted.names) <= set(job.cameras.names) or wanted.size != job.cameras.size:
@@ -136,11 +130,12 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
     return job.cameras
 
 
-def _load(job: RolloutJob, checkpoint: Checkpoint) -> LearnedPolicy:
+def _load(job: RolloutJob, path: Path) -> LearnedPolicy:
     from manip_il.learn.policy import LearnedPolicy
 
     driver = job.driver
     trust, device = (driver.trust, driver.device) if isinstance(driver, PolicyDriver) else (False, "cpu")
+    checkpoint = Checkpoint.open(path)
     spec = env_spec(job.env, observed_cameras(job))
     checkpoint.check_fits(spec)
     return LearnedPolicy.load(checkpoint, device, spec.instruction, trust=trust)
