@@ -17,11 +17,11 @@ import mujoco
 import numpy as np
 from _machine import describe_machine
 
-from manip_il.collect.expert import Expert
+from manip_il import Expert
 from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import ManipEnv
-from manip_il.tasks.envs import make_env
+from manip_il.worlds.ladder.envs import make_env
 
 STEPS = 30  # steps per episode: how many the expert takes from the start to the goal
 
@@ -65,7 +65,7 @@ def record(env: ManipEnv, expert: Expert) -> tuple[np.ndarray, float]:
     started = time.perf_counter()
     for step in range(STEPS):
         env.observe()
-        label = expert.label(env.get_state(), env.world)
+        label = expert.label(env.get_state(), env)
         env.advance(label.action)
         controls[step] = env.data.ctrl
     return controls, time.perf_counter() - started

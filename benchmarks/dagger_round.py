@@ -17,16 +17,16 @@ from pathlib import Path
 
 from _machine import describe_machine
 
+from manip_il import Expert
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.results import Result
 from manip_il.algorithms.rounds import DATASET, round_folder
 from manip_il.algorithms.run import Run
-from manip_il.collect.expert import Expert
 from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import State
-from manip_il.tasks.envs import scene_of
+from manip_il.worlds.ladder.envs import scene_of
 
 LIMIT, SHARE = 30.0, 0.15  # time of a round [s], and the largest share of it for labelling
 

@@ -25,7 +25,6 @@ import numpy as np
 from _machine import describe_machine
 
 from manip_il.collect.drivers import PolicyDriver
-from manip_il.collect.environments import env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
@@ -35,8 +34,9 @@ from manip_il.learn.train import Trainer
 from manip_il.mdp import Episode
 from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
-from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.envs import env_of
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.table import env_spec, make_config
 
 BIN = Path(sys.executable).parent
 TASK = "pick_place"

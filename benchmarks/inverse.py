@@ -30,9 +30,9 @@ from manip_il.tasks.carry.grid import Grid
 from manip_il.tasks.carry.layout import TASTES
 from manip_il.tasks.carry.obstacles import layout_of
 from manip_il.tasks.carry.paths import PathProblem, cheapest_path, plan
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import env_of
 from manip_il.tasks.pick_place import OBJECT
+from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.table import make_config
 
 F64 = NDArray[np.float64]
 ABOVE = {"max_margin": 0.10, "bayesian": 0.03, "max_entropy": 0.03}

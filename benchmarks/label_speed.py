@@ -19,15 +19,15 @@ import numpy as np
 import qpsolvers
 from _machine import describe_machine
 
+from manip_il import Expert
 from manip_il.collect.drivers import driver_of
-from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.mdp import State
 from manip_il.robots import ROBOTS, ik
 from manip_il.seeding import stream_seeds
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import TASKS
+from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.table import make_config
 
 
 def main() -> int:

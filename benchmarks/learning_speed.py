@@ -26,7 +26,7 @@ from manip_il.chapter.learning import LearningRun
 from manip_il.cli.main import main as command
 from manip_il.collect.workers import Engine
 from manip_il.sim.env import ManipEnv
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import make_config
 
 SCENES = (("panda", "reach"), ("panda", "pick_place"), ("fetch", "pick_place"))
 NEVER = 10**9

@@ -21,7 +21,7 @@ from typing import Any
 
 from _machine import describe_machine
 
-from manip_il.collect.expert import Expert
+from manip_il import Expert
 from manip_il.mdp import State
 from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
@@ -29,7 +29,7 @@ from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, FILM, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import camera_id
-from manip_il.tasks.envs import make_env
+from manip_il.worlds.ladder.envs import make_env
 
 SIZES = ((128, 128), (240, 320), (480, 640))
 STATES = 6  # number of states from one expert episode, evenly spaced

@@ -23,13 +23,12 @@ from _machine import describe_machine
 from ray.cluster_utils import Cluster
 
 from manip_il import __version__
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.collect.workers import Engine
 from manip_il.data.journal import Journal
 from manip_il.seeding import stream_seeds
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 NODES = 4
 TURNS = 5

@@ -28,7 +28,6 @@ from scipy.stats import binomtest
 from manip_il.chapter.inverse import CARRY, METHODS, carried_stretch, learn, read_carried
 from manip_il.cli.main import main as manip_il
 from manip_il.collect.drivers import PolicyDriver
-from manip_il.collect.environments import env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes, read_journal
@@ -37,9 +36,10 @@ from manip_il.mdp import F64, Episode
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 from manip_il.tasks.carry.layout import OBSTACLES, TASTES, Layout, Reward
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
-from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.envs import env_of, scene_of
 from manip_il.tasks.pick_place import OBJECT
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.ladder.envs import env_of, scene_of
+from manip_il.worlds.table import env_spec, make_config
 
 FEW = 2  # most things in a demonstrated layout
 ARMS = ("panda", "fetch", "so101")

@@ -32,7 +32,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import collect
 from manip_il.collect.workers import Engine
 from manip_il.data.journal import episode_path, list_seeds
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import make_config
 
 FIRST = 100
 TURNS = 3

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from manip_il.collect.expert import Expert
+from manip_il import Expert
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import FILM
 from manip_il.sim.render import Picture
-from manip_il.tasks.envs import make_env
 from manip_il.tasks.table import TASKS
+from manip_il.worlds.ladder.envs import make_env
 
 FRAMES = 6  # frames per strip
 CROP = (slice(90, 450), slice(130, 610))  # part of the front camera's picture with the task in it [pixels]

@@ -21,11 +21,12 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 
 import datasets
 from manip_il.data.dataset import Dataset
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, RobotTaskSpec, features
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, features
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.mlp import MLPConfig
 from manip_il.learn.network import threads
 from manip_il.learn.train import Trainer
+from manip_il.worlds.contract import EnvironmentSpec
 
 BATCH = 512
 SECONDS = 3.0  # duration of each measurement [s]
@@ -91,7 +92,7 @@ def endless(loader: torch.utils.data.DataLoader):
 def make_dataset(root: Path, episodes: int = 20, length: int = 100, n: int = 8, k: int = 30) -> Path:
     rng = np.random.default_rng(0)
     joints, things = tuple(f"joint_{i}" for i in range(n)), tuple(f"number_{i}" for i in range(k))
-    spec = RobotTaskSpec("benchmark", "benchmark", 25, joints, things, 1, "benchmark")
+    spec = EnvironmentSpec("benchmark", "benchmark", 25, joints, things, 1, "benchmark")
     columns = {key: value for key, value in features(spec).items() if key in LEARNING}
     dataset = LeRobotDataset.create("manip/benchmark", int(spec.fps), columns, root=root, use_videos=False)
     for _ in range(episodes):

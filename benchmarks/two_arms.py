@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from manip_il.tasks.stock.aloha.environment import AlohaEnv
-from manip_il.tasks.stock.aloha.expert import AlohaExpert
+from manip_il.worlds.aloha.environment import AlohaEnv
+from manip_il.worlds.aloha.expert import AlohaExpert
 
 OUTPUT = Path(__file__).parent.parent / "docs" / "two_arms.gif"
 HEIGHT, WIDTH, CAMERA = 200, 320, "angle"
@@ -46,18 +46,18 @@ def film(knock: Knock) -> list[Image.Image]:
     env.start(knock.seed)
     body = env.model.body(knock.thing).id
     frames: list[Image.Image] = []
-    left, caption = knock.steps, 0
+    left, caption, solved = knock.steps, 0, False
     for step in range(HORIZON):
         label = expert.label(env.get_state())
         phase = env.task.phases[label.phase]
         pushed = left > 0 and (left < knock.steps or phase == knock.phase)
         left, caption = left - pushed, SAID if pushed else caption - 1
         env.data.xfrc_applied[body, :3] = knock.force if pushed else 0.0
-        if step % EVERY == 0 or env.solved:
+        if step % EVERY == 0 or solved:
             frames.append(captioned(env.draw(height=HEIGHT, width=WIDTH, camera_id=CAMERA), phase, caption > 0))
-        if env.solved:
+        if solved:
             return frames
-        env.advance(label.action)
+        solved = env.step(label.action).solved
     raise RuntimeError(f"{knock.task} was not solved within {HORIZON} steps")
 
 

@@ -33,7 +33,7 @@ from manip_il.mdp import Episode
 
 LENGTH = 100  # frames per episode
 REPO = "someone/benchmark"
-STATE_ONLY = s.RobotTaskSpec(
+STATE_ONLY = s.EnvironmentSpec(
     robot="benchmark",
     task="benchmark",
     fps=25,
@@ -44,7 +44,7 @@ STATE_ONLY = s.RobotTaskSpec(
 )
 FILMED = replace(STATE_ONLY, cameras=("front", "wrist"), image_size=(128, 128))
 
-Write = Callable[[Path, s.RobotTaskSpec, list[Episode]], None]
+Write = Callable[[Path, s.EnvironmentSpec, list[Episode]], None]
 
 
 def main() -> int:
@@ -71,7 +71,7 @@ def main() -> int:
     return 0
 
 
-def rate(write: Write, spec: s.RobotTaskSpec, episodes: list[Episode]) -> float:
+def rate(write: Write, spec: s.EnvironmentSpec, episodes: list[Episode]) -> float:
     """Return frames per second, from nothing to a whole dataset."""
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
@@ -79,11 +79,11 @@ def rate(write: Write, spec: s.RobotTaskSpec, episodes: list[Episode]) -> float:
         return sum(map(len, episodes)) / (time.perf_counter() - started)
 
 
-def ours(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode]) -> None:
+def ours(root: Path, spec: s.EnvironmentSpec, episodes: list[Episode]) -> None:
     write_dataset(episodes, root, spec, fingerprint={}, video=VideoConfig("libsvtav1"))
 
 
-def peer_default(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode], streaming: bool = False) -> None:
+def peer_default(root: Path, spec: s.EnvironmentSpec, episodes: list[Episode], streaming: bool = False) -> None:
     dataset = LeRobotDataset.create(
         REPO,
         int(spec.fps),
@@ -102,11 +102,11 @@ def peer_default(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode], str
     dataset.finalize()
 
 
-def peer_streaming(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode]) -> None:
+def peer_streaming(root: Path, spec: s.EnvironmentSpec, episodes: list[Episode]) -> None:
     peer_default(root, spec, episodes, streaming=True)
 
 
-def make_episode(spec: s.RobotTaskSpec, seed: int) -> Episode:
+def make_episode(spec: s.EnvironmentSpec, seed: int) -> Episode:
     rng = np.random.default_rng(seed)
     columns = {key: column(rng, feature) for key, feature in s.features(spec).items()}
     columns[s.SEED][:] = seed

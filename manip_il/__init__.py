@@ -19,18 +19,18 @@ if not os.environ.get("MUJOCO_GL") and ctypes.util.find_library("EGL"):
 register_envs()
 
 __version__ = "0.1.0"
-_HOMES = {  # public name -> module
+_HOMES = {  # public name -> module, and the name there if it differs
     "CameraConfig": "sim.config",
     "Checkpoint": "learn.checkpoint",
     "Dataset": "data.dataset",
-    "Expert": "collect.expert",
+    "Expert": "worlds.ladder.expert:LadderExpert",
     "FitConfig": "learn.fit_config",
     "LearnedPolicy": "learn.policy",
     "State": "mdp",
     "dagger": "api",
     "evaluate": "api",
-    "make_config": "tasks.config",
-    "make_env": "tasks.envs",
+    "make_config": "worlds.table",
+    "make_env": "worlds.ladder.envs",
     "record": "api",
     "train": "api",
 }
@@ -40,7 +40,8 @@ def __getattr__(name: str) -> Any:
     """Import a public name on first use; `__init__.pyi` has the types."""
     if name not in _HOMES:
         raise AttributeError(f"module 'manip_il' has no attribute {name!r}")
-    return getattr(import_module(f"manip_il.{_HOMES[name]}"), name)
+    home, _, own_name = _HOMES[name].partition(":")
+    return getattr(import_module(f"manip_il.{home}"), own_name or name)
 
 
 def __dir__() -> list[str]:

@@ -1,13 +1,13 @@
 from manip_il.api import dagger, evaluate, record, train
-from manip_il.collect.expert import Expert
 from manip_il.data.dataset import Dataset
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.mdp import State
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import make_env
+from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.expert import LadderExpert as Expert
+from manip_il.worlds.table import make_config
 
 __all__ = [
     "CameraConfig",

@@ -18,7 +18,6 @@ from manip_il.algorithms.config import BetaSchedule, RunConfig, check_labels
 from manip_il.algorithms.results import Result
 from manip_il.algorithms.run import Run
 from manip_il.collect.drivers import PolicyDriver
-from manip_il.collect.environments import is_known
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import parse_query
 from manip_il.collect.record import MAX_TRIES, collect, collect_successes, provenance
@@ -37,7 +36,8 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.option import make_options, takes
 from manip_il.seeding import BLOCK, stream_base, stream_seeds
 from manip_il.sim.conditions import NOMINAL
-from manip_il.tasks.config import EnvConfig, make_config, stored_config
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import make_config, stored_config, world_of
 
 Policy = Checkpoint | Path | str
 Data = Dataset | Path | str
@@ -164,7 +164,7 @@ def evaluate(
         origin = None if path is None else Checkpoint.open(path).origin
         if origin is None:
             raise UsageError("env is missing, and the policy does not name one")
-        if not is_known(origin.robot, origin.task, origin.object):
+        if world_of(origin.robot).own_files(origin.robot, origin.task, origin.object):
             raise UsageError(
                 f"the policy is for the robot {origin.robot} and the task {origin.task} of your own, of which it holds "
                 "only the names; give env=make_config(...) with your files"

@@ -20,9 +20,9 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Images = Mapping[str, NDArray[np.uint8]]  # camera -> (B, H, W, 3)
+IMAGES = "observation.images."  # prefix of a camera's picture column
 KEYPOINTS = "privileged.keypoints."  # prefix of a camera's keypoint column; stored only with its pictures
 STATE_EXTRAS = 4  # numbers in a `sim_state` besides physics and variation
-LONGEST_EPISODE = 10_000  # [control steps]; eight minutes at 20 Hz
 
 
 class Actor(IntEnum):

@@ -31,7 +31,7 @@ SIDE, COLUMNS, ROWS = 24, 4, 3  # smaller squares, and the default compression m
 LENGTHS = (7, 1, 13)
 
 
-def with_cameras(spec: s.RobotTaskSpec, *cameras: str) -> s.RobotTaskSpec:
+def with_cameras(spec: s.EnvironmentSpec, *cameras: str) -> s.EnvironmentSpec:
     return replace(spec, cameras=cameras, image_size=(ROWS * SIDE, COLUMNS * SIDE))
 
 
@@ -51,7 +51,7 @@ def numbers_of(pictures: np.ndarray) -> list[int]:
     return [number_of(picture) for picture in pictures]
 
 
-def numbered_episodes(make_episode: Callable[..., Episode], spec: s.RobotTaskSpec, count: int = 3) -> list[Episode]:
+def numbered_episodes(make_episode: Callable[..., Episode], spec: s.EnvironmentSpec, count: int = 3) -> list[Episode]:
     """Of lengths 7, 1 and 13 in turn; pictures count on through all episodes of one camera, then of the next."""
     lengths = [LENGTHS[index % 3] for index in range(count)]
     starts = np.cumsum([0, *lengths])
@@ -86,7 +86,7 @@ def store_pictures(root: Path, key: str, pictures: list[bytes], size: tuple[int,
 
 
 def write(
-    episodes: list[Episode], root: Path, spec: s.RobotTaskSpec, size: float | None = None, **options: Any
+    episodes: list[Episode], root: Path, spec: s.EnvironmentSpec, size: float | None = None, **options: Any
 ) -> Path:
     """Write a dataset with options of `write_dataset`. size: of its files [MB]."""
     with pytest.MonkeyPatch.context() as patch:

@@ -24,8 +24,8 @@ def offline(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def spec() -> s.RobotTaskSpec:
-    return s.RobotTaskSpec(
+def spec() -> s.EnvironmentSpec:
+    return s.EnvironmentSpec(
         robot="panda",
         task="lift",
         fps=20,
@@ -41,7 +41,7 @@ def spec() -> s.RobotTaskSpec:
 
 
 @pytest.fixture(scope="session")
-def make_episode(spec: s.RobotTaskSpec) -> MakeEpisode:
+def make_episode(spec: s.EnvironmentSpec) -> MakeEpisode:
     def make(seed: int, length: int = 9, success: bool = True) -> Episode:
         rng = np.random.default_rng(seed)
         columns = {key: _random(rng, length, feature) for key, feature in s.features(spec).items()}

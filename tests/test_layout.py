@@ -90,6 +90,7 @@ def test_other_code_is_found_by_the_packages_own_tables_alone():
         ("bridges/mcap/importing.py", "read_messages"),
         ("option.py", "type_of"),
         ("sim/render.py", "_context"),
+        ("worlds/table.py", "world_of"),
     }
 
 
@@ -97,10 +98,10 @@ def test_a_text_becomes_a_path_only_where_a_person_typed_it():
     assert {(file, function) for file, function, _ in calls("typed")} == {
         ("cli/options.py", "decode"),
         ("lerobot_plugin/environment.py", "_given"),
-        ("tasks/config.py", "make_config"),
+        ("worlds/table.py", "make_config"),
     }
     assert {(file, function) for file, function, _ in calls("make_config")} == {
         ("api.py", "_env"),  # written in Python
         ("evaluation/robot_check.py", "check_robot"),  # of the robot on the command line
-        ("tasks/envs.py", "make_env"),
+        ("worlds/ladder/envs.py", "make_env"),
     }

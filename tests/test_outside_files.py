@@ -19,13 +19,13 @@ ALLOWED = {
     "cli/main.py": "os.devnull",
     "cli/outputs.py": "the folder that a command is about to write",
     "collect/ray_pool.py": "what this process opened before it sends it to a node",
-    "data/fingerprint.py": "the kernel's files of the processor",
+    "worlds/fingerprint.py": "the kernel's files of the processor",
     "data/atomic.py": "locks and flushes what it writes",
     "chapter/learning.py": "the state of a run's own last checkpoint",
     "robots/files.py": "a user's model, after its included files were read",
     "serve/operator.py": "the kernel's file of this process",
     "sim/scene.py": "the empty scene, which ships with the package",
-    "tasks/stock/aloha/expert.py": "a model in an installed package",
+    "worlds/aloha/expert.py": "a model in an installed package",
     "tasks/table.py": "the source of code that runs already",
 }
 

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from manip_il import Expert
 from manip_il.bridges.doctor.examine import examine_folder
 from manip_il.collect.edits import render_states
-from manip_il.collect.environments import env_fingerprint, env_spec
-from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.data import schema
 from manip_il.data.build import build
@@ -22,8 +21,9 @@ from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.shape import KINDS as SHAPES
 from manip_il.sim.variation import with_drawn
-from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.envs import env_of
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from .pictures import read_episodes
 from .tables import SCENES

@@ -11,8 +11,8 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import Seeded, check_bounds, option
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import env_spec, make_config
 
 if TYPE_CHECKING:  # so that `manip-il dagger --help` does not import numpy
     from manip_il.collect.query import Query
@@ -128,8 +128,8 @@ class RunConfig(Seeded):
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        if self.disturbed_share and self.env.robot in STOCK:
-            raise UsageError(f"disturbed_share is {self.disturbed_share}; expected 0 for stock robot {self.env.robot}")
+        if self.disturbed_share:
+            env_spec(self.env).require("varied", "give --disturbed_share=0")
         if self.redraw and (self.cameras is None or self.label != "per_state"):
             raise UsageError("redraw is for picture policies; give --cameras and --label=per_state")
         if self.method not in ALGORITHMS:

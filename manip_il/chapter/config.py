@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from manip_il.option import Seeded, check_bounds, option
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 LONGER = 1.5  # default episode length relative to the longest demonstration
 

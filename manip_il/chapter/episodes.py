@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.collect.environments import make_env
 from manip_il.data.dataset import joined_columns
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ACTION, ACTOR, ENVIRONMENT_STATE, LABEL_VALID, STATE, SUCCESS
@@ -34,7 +33,8 @@ from manip_il.errors import NothingToLearnError, UsageError
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.network import MLPNetwork
 from manip_il.mdp import F32, F64, Actor, require_finite
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import make_env
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,8 +148,8 @@ class RobotEpisode:
 
     def advance(self, action: F64) -> None:
         """Apply joint targets and the gripper's opening (n,)."""
-        self._env.advance(action)
-        if self._held or self._env.solved:
+        solved = self._env.step(action).solved
+        if self._held or solved:
             self._held += 1
 
     @property

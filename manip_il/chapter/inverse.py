@@ -28,9 +28,9 @@ from manip_il.tasks.carry.grid import Grid
 from manip_il.tasks.carry.layout import FEATURES
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
 from manip_il.tasks.carry.paths import LENGTH, Demonstration, cheapest_path, open_features, plan, rivals
-from manip_il.tasks.envs import scene_of
 from manip_il.tasks.ladder import AT_GOAL
 from manip_il.tasks.pick_place import OBJECT
+from manip_il.worlds.ladder.envs import scene_of
 
 METHODS = ("max_margin", "bayesian", "max_entropy")
 LEVEL = 0.9  # level of the credible intervals

@@ -30,7 +30,6 @@ from manip_il.chapter.episodes import ActionRange, Lockstep, RobotEpisode, Trans
 from manip_il.chapter.ppo import Learner, save_policy, seed_generators, start_conversion, start_policy
 from manip_il.chapter.reward import LearnedReward
 from manip_il.collect.drivers import PolicyDriver
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.data.atomic import new_folder
 from manip_il.data.dataset import Dataset
@@ -50,6 +49,7 @@ from manip_il.learn.training_state import (
 )
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
+from manip_il.worlds.table import env_fingerprint, env_spec
 
 _CHECKPOINTS = "checkpoints"
 _WEIGHTS = "weights.safetensors"

@@ -24,7 +24,7 @@ from torch.distributions import Normal
 
 from manip_il.chapter.config import PPOConfig
 from manip_il.chapter.episodes import Lockstep, Transitions
-from manip_il.data.schema import ENVIRONMENT_STATE, STATE, RobotTaskSpec, features
+from manip_il.data.schema import ENVIRONMENT_STATE, STATE, features
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.action_spaces import Conversion, conversion_for
 from manip_il.learn.action_steps import add_steps, is_in_processors
@@ -35,6 +35,7 @@ from manip_il.learn.mlp import MLPConfig, MLPPolicy
 from manip_il.learn.names import EE_DELTA, MLP
 from manip_il.learn.network import MLPNetwork, fit_statistics, perceptron, read_weights
 from manip_il.mdp import F32
+from manip_il.worlds.contract import EnvironmentSpec
 
 EXTRA = 2  # numbers appended to the policy's inputs: flag of the absorbing state, elapsed share of the episode
 _GAUSSIAN = "gaussian"
@@ -217,7 +218,7 @@ def seed_generators(seed: int) -> None:
     np.random.seed(seed % 2**32)  # noqa: NPY002
 
 
-def start_conversion(start: Checkpoint | None, space: str | None, spec: RobotTaskSpec) -> Conversion:
+def start_conversion(start: Checkpoint | None, space: str | None, spec: EnvironmentSpec) -> Conversion:
     """Return the conversion of the actor's actions.
 
     Args:
@@ -242,7 +243,7 @@ def start_conversion(start: Checkpoint | None, space: str | None, spec: RobotTas
 
 
 def start_policy(
-    start: Checkpoint | None, conversion: Conversion, spec: RobotTaskSpec, rows: tuple[F32, F32] | None
+    start: Checkpoint | None, conversion: Conversion, spec: EnvironmentSpec, rows: tuple[F32, F32] | None
 ) -> MLPPolicy:
     """Return an mlp with a Gaussian loss, whose new weights are drawn from torch's global generator.
 

@@ -16,11 +16,11 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from manip_il import checks
-from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.checkpoint import CONFIG, META_FILE, WEIGHTS, Origin, in_one_line, read_config, read_origin
 from manip_il.learn.network import read_weights, threads
 from manip_il.mdp import F32, F64
+from manip_il.worlds.contract import EnvironmentSpec
 
 PREFERENCE = "preference"  # type of a learnt reward in config.json
 _ROWS = 16_384  # rows evaluated at a time
@@ -43,7 +43,7 @@ class RewardShape:
     unread: tuple[int, ...] = ()
 
 
-def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
+def ways_of(spec: EnvironmentSpec) -> tuple[tuple[int, ...], ...]:
     """Return the input columns of every offset in the environment state, such as `goal_from_object`.
 
     Each offset appears twice, in 3D and in the plane of the table, because the hand approaches from above.
@@ -54,7 +54,7 @@ def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(place[one] for one in way) for way in axes if set(way) <= place.keys())
 
 
-def joints_of(spec: RobotTaskSpec) -> tuple[int, ...]:
+def joints_of(spec: EnvironmentSpec) -> tuple[int, ...]:
     """Return the input columns of the arm's joints and their targets if the environment state has the hand's pose.
 
     Otherwise return (). A few hundred answers are too few to learn that joints are redundant with the pose.
@@ -65,7 +65,7 @@ def joints_of(spec: RobotTaskSpec) -> tuple[int, ...]:
     return (*range(arm), *range(action, action + arm))
 
 
-def shape_for(spec: RobotTaskSpec, members: int) -> RewardShape:
+def shape_for(spec: EnvironmentSpec, members: int) -> RewardShape:
     """Return the shape of the networks to fit to answers about a task's clips."""
     return RewardShape(members, ways=ways_of(spec), unread=joints_of(spec))
 
@@ -154,7 +154,7 @@ class LearnedReward:
             network.load_state_dict(read_weights(path))
         return cls(network, origin)
 
-    def check_fits(self, name: str, spec: RobotTaskSpec) -> None:
+    def check_fits(self, name: str, spec: EnvironmentSpec) -> None:
         """Raise `MismatchError` unless `spec` has this reward's task and columns. name: what messages call `spec`."""
         if self.origin.task != spec.task:
             raise MismatchError("task", "the reward", self.origin.task, name, spec.task)
@@ -178,7 +178,7 @@ class LearnedReward:
 def write_reward(
     folder: Path,
     network: RewardNetwork,
-    spec: RobotTaskSpec,
+    spec: EnvironmentSpec,
     options: Mapping[str, Any],
     fingerprint: Mapping[str, Any],
 ) -> None:

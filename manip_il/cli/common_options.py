@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Literal
 from manip_il.cli.options import Given, given
 from manip_il.option import option
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
-from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.stock import table as stock
+from manip_il.worlds.config import WORLDS, EnvConfig
+from manip_il.worlds.table import env_spec
 
 if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
@@ -23,8 +23,10 @@ DATASET = "a LeRobot v3.0 dataset"
 
 
 def default_cameras(env: EnvConfig) -> tuple[str, ...]:
-    """Return the cameras used if none are named: all, but for a stock robot only its first."""
-    return (stock.ROBOTS[env.robot].cameras[:1] if env.robot in stock.ROBOTS else ()) or CAMERAS
+    """Return the cameras used if none are named; raise `Unable` if no camera draws the environment."""
+    spec = env_spec(env)
+    spec.require("drawn", "it has no cameras")
+    return spec.default_cameras
 
 
 @dataclass(frozen=True)
@@ -88,14 +90,17 @@ class Pictured:
 
     cameras: list[str] = option(
         list,
-        f"any of {', '.join(CAMERAS)}; for aloha: top, angle, front_close, left_wrist, right_wrist, ...; "
+        f"any of {', '.join(CAMERAS)}; "
+        f"{''.join(f'for {name}: ' + ', '.join(one.cameras) + '; ' for name, one in WORLDS.items() if one.cameras)}"
         "by default all if pictures are needed, else none",
     )
     image: Given = given(CameraConfig)
 
     def camera_config(self, env: EnvConfig, look: Look | None = None) -> CameraConfig:
         """Return the cameras, by default those of `default_cameras`; `UsageError` for an invalid value."""
-        return CameraConfig(tuple(self.cameras) or default_cameras(env), **self.image, look=look or Look())
+        cameras = CameraConfig(tuple(self.cameras) or default_cameras(env), **self.image, look=look or Look())
+        env_spec(env).require_cameras(cameras)
+        return cameras
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from manip_il.cli.options import Given, Open, given, group
 from manip_il.cli.outputs import ResumableOutput
 from manip_il.option import Seeded, option
 from manip_il.seeding import MAX_SEED
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from manip_il.cli.outputs import ResumableOutput
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 _OF_FIT = ("policy", "action_space", "observation", "steps", "batch_size", "lr", "optimizer", "scheduler")
 

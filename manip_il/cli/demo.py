@@ -12,7 +12,7 @@ from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import ResumableOutput
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 RUN: Given = {"demonstrations": 100, "rounds": 3, "validation_episodes": 100}  # replace the defaults of dagger
 FIT: Given = {"steps": 3_000, "batch_size": 256}

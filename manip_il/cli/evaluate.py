@@ -10,7 +10,7 @@ from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusti
 from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import ResumableOutput
 from manip_il.option import Seeded, option
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 
 @dataclass(frozen=True)

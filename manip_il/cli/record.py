@@ -11,7 +11,7 @@ from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import Resumable
 from manip_il.data.video_config import VideoConfig
 from manip_il.option import Seeded, option
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 
 @dataclass(frozen=True)

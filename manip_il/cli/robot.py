@@ -11,7 +11,7 @@ from manip_il.cli.options import Given, given, group
 from manip_il.cli.outputs import Output, Replacing
 from manip_il.option import NameOrPath, Seeded, option
 from manip_il.tasks import NAMES
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 
 @dataclass(frozen=True)

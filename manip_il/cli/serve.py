@@ -9,7 +9,7 @@ from manip_il.cli.common_options import Trusting, Varied
 from manip_il.cli.options import Given, given
 from manip_il.option import option
 from manip_il.serve.config import ServoConfig, SessionConfig
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 
 @dataclass(frozen=True)

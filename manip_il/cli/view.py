@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 from manip_il.cli.common_options import OF_POLICY, Tested, Trusting
 from manip_il.cli.options import Given, given
 from manip_il.option import Seeded, option
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 IN_A_FILE = 3  # episodes written to a file by default
 

@@ -6,7 +6,7 @@ appears when it is complete.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.caching import PerThread
-from manip_il.collect.environments import env_actions, env_fingerprint, env_spec, make_env, make_expert
 from manip_il.collect.scenes import CHUNK, SceneDrawer, Scenes
 from manip_il.collect.workers import map_in_order
 from manip_il.data import schema
@@ -28,13 +27,12 @@ from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.info import Info
 from manip_il.data.lerobot_layout import OURS, Features
 from manip_il.data.lerobot_write import write_dataset, write_episodes
-from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
-from manip_il.mdp import F64, Episode, State
+from manip_il.errors import ManipError, MismatchError, NothingToLearnError
+from manip_il.mdp import F64, Episode, Label, State
 from manip_il.option import NameOrPath
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import EnvConfig, stored_config
-from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import described_env, env_fingerprint, env_spec, make_env, make_expert, stored_config
 
 Columns = dict[str, NDArray[Any]]
 _COMPARED = ("model_sha256", "mujoco")  # entries of a fingerprint that affect restored states
@@ -79,6 +77,7 @@ def open_source(
         )
     env = stored_config(spec, robot, task, shape)
     given = env_spec(env)
+    given.require("restored", "record again what you need")
     for what in ("robot", "task", "object", "sim_state_size"):
         if getattr(given, what) != getattr(spec, what):
             raise MismatchError(what, str(root), getattr(spec, what), f"the given {what}", getattr(given, what))
@@ -109,7 +108,7 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
     `write_episodes` raise, and `ManipError` if a worker dies.
     """
     source.check_has_no_sag("data relabel")
-    scale, dataset = env_actions(source.env).scale, source.dataset
+    scale, dataset = described_env(source.env).actions.scale, source.dataset
     simulated = {key: value for key, value in dataset.fingerprint.items() if key.endswith("_sha256")}
     fingerprint = {**env_fingerprint(source.env), **simulated}
     own = Own(dataset.spec, fingerprint, {**dataset.provenance, "relabelled": _origin(source)})
@@ -142,6 +141,11 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
     """
     if scenes.branch_steps > 1:
         source.check_has_no_sag("--branch_steps")
+    spec = env_spec(source.env, scenes.cameras)
+    if scenes.anew:
+        spec.require("redrawn", "give --scenes=false")
+    if scenes.conditions:
+        spec.require("varied", "leave out --vary")
     columns = source.dataset.columns([schema.SIM_STATE, schema.ACTION, schema.LABEL_VALID])
     drawn = {
         "scenes": scenes.anew,
@@ -152,11 +156,21 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
     seeds = scenes.numbers[::CHUNK]
     tried = {"seeds": [seeds[0], seeds[-1]], "tried": len(seeds)}
     provenance = {"redrawn": {**_origin(source), **drawn, **vary}, **tried}
-    spec = replace(env_spec(source.env, scenes.cameras), video=False)  # frames are independent scenes
+    spec = replace(spec, video=False)  # frames are independent scenes
     fingerprint = env_fingerprint(source.env, scenes.cameras)
-    work = partial(_draw_scenes, source.env, scenes)
     pieces = scenes.chunks(columns[schema.SIM_STATE], _leads(source, columns))
-    return _write(target, spec, fingerprint, provenance, work, pieces)
+
+    def episodes() -> Iterator[Episode]:
+        empty = True
+        for _, found in made:
+            yield from found
+            empty = empty and not found
+            target.on_piece()
+        if empty:
+            raise NothingToLearnError("no scene has a valid expert label, so there is nothing to learn from")
+
+    with closing(map_in_order(partial(_draw_scenes, source.env, scenes), pieces, target.workers)) as made:
+        return write_dataset(episodes(), target.root, spec, provenance, replace=target.replace, fingerprint=fingerprint)
 
 
 def _rewrite(
@@ -178,36 +192,12 @@ def _rewrite(
         )
 
 
-def _write[T](
-    target: EditTarget,
-    spec: RobotTaskSpec,
-    fingerprint: Mapping[str, Any],
-    provenance: Mapping[str, Any],
-    work: Callable[[T], list[Episode]],
-    pieces: Iterable[T],
-) -> Info:
-    """Write the episodes that workers make from each piece, in order."""
-
-    def episodes() -> Iterator[Episode]:
-        empty = True
-        for _, found in made:
-            yield from found
-            empty = empty and not found
-            target.on_piece()
-        if empty:
-            raise NothingToLearnError("no scene has a valid expert label, so there is nothing to learn from")
-
-    with closing(map_in_order(work, pieces, target.workers)) as made:
-        return write_dataset(episodes(), target.root, spec, provenance, replace=target.replace, fingerprint=fingerprint)
-
-
 def label_states(env: EnvConfig, states: NDArray[Any]) -> Columns:
     """Return the expert's labels of states, rows of `sim_state` (T, m), as columns of a dataset, (T,) or (T, n).
 
     If a label is invalid, its action holds the arm still and `label_valid` is 0.
     """
-    expert = make_expert(env)
-    labels = [expert.label(State.from_vector(state)) for state in states]
+    labels = _labels(env, states)
     return {
         schema.ACTION: np.stack([label.action for label in labels]).astype(np.float32),
         schema.LABEL_VALID: np.array([label.valid for label in labels], np.int64),
@@ -215,13 +205,16 @@ def label_states(env: EnvConfig, states: NDArray[Any]) -> Columns:
     }
 
 
+def _labels(env: EnvConfig, states: NDArray[Any]) -> list[Label]:
+    expert = make_expert(env)
+    return [expert.label(State.from_vector(state)) for state in states]
+
+
 def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -> Columns:
     """Render states, rows of `sim_state` (T, m), to columns: pictures (T, height, width, 3), keypoints (T, 3 K).
 
     The values are bit-equal to what an environment with these cameras observes. Raises `RenderError` without OpenGL.
     """
-    if env.robot in STOCK and not STOCK[env.robot].cameras:
-        raise RenderError(f"{env.robot} has no cameras")
     view = make_env(env, cameras)
     spec = env_spec(env, cameras)
     rows = len(states)
@@ -248,9 +241,7 @@ def _leads(source: EditSource, columns: Columns) -> F64:
     action = columns[schema.ACTION].astype(np.float64)
     if not _is_served(source.dataset.provenance):
         return np.zeros_like(action)
-    expert = make_expert(source.env)
-    labels = [expert.label(State.from_vector(state)) for state in columns[schema.SIM_STATE]]
-    own = np.stack([label.action for label in labels])
+    own = np.stack([label.action for label in _labels(source.env, columns[schema.SIM_STATE])])
     return np.where(columns[schema.LABEL_VALID].reshape(-1, 1) > 0, action - own, 0.0)
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manip_il.collect.drivers import Driver, ExpertDriver, PolicyDriver, Setting
-from manip_il.collect.environments import env_actions, env_spec, make_env, make_expert
 from manip_il.collect.query import LabelMode, Query, branch, cut_at_takeover, gate_of, labelled
-from manip_il.collect.rollout import Act, Environment, Rules, rollout
+from manip_il.collect.rollout import Act, Rules, rollout
 from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.errors import MismatchError
 from manip_il.learn.checkpoint import Checkpoint
@@ -20,8 +19,9 @@ from manip_il.option import check_bounds
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.shape import draws_shape
-from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.contract import Environment
+from manip_il.worlds.table import env_spec, make_env, make_expert
 
 if TYPE_CHECKING:  # torch is imported only if a learner drives
     from manip_il.learn.policy import LearnedPolicy
@@ -73,7 +73,10 @@ class RolloutJob:
         cameras = observed_cameras(self)
         envs = [make_env(self.env, cameras, self.conditions) for _ in range(min(self._lockstep(), len(seeds)))]
         noise = [one.only("sensing") for one in self.conditions]
-        branch_env = make_env(self.env, self.cameras, noise) if self.label == "branch" else None
+        branch_env = None
+        if self.label == "branch":
+            env_spec(self.env).require("restored", "give another --label than branch")
+            branch_env = make_env(self.env, self.cameras, noise)
         steps = run_steps(self, envs, seeds)
         for frames in group_rollouts(map(_without_pictures, steps) if self.cameras is None and cameras else steps):
             drawn = draw(self.conditions, frames[0].seed, self.env.object)
@@ -84,7 +87,7 @@ class RolloutJob:
         if self.policy is None:
             return 1  # a single environment makes best use of the processor's cache
         varies = draws_shape(self.env.object) or any(one.only("model").ranges for one in self.conditions)
-        return min(self.batch, OWN_MODELS) if varies or self.env.robot in STOCK else self.batch
+        return self.batch if env_spec(self.env).shares_model and not varies else min(self.batch, OWN_MODELS)
 
     def _to_episode(self, frames: list[Transition], branch_env: Environment | None) -> Episode:
         """Return an episode from its frames, with the labels, takeover or branches that `label` asks for."""
@@ -107,8 +110,8 @@ def run_steps(
     job: RolloutJob, envs: Sequence[Environment], seeds: Iterable[int], act: Act | None = None
 ) -> Iterator[Transition]:
     """Run a job's episodes in these environments and yield every step. act: replaces the job's driver."""
-    policies = tuple(_load(job, path, envs[0]) for path in job.driver.policies)
-    setting = Setting(env_actions(job.env), job.env.horizon, policies)
+    policies = tuple(_load(job, path) for path in job.driver.policies)
+    setting = Setting(envs[0].actions, job.env.horizon, policies)
     rules = Rules(job.env.horizon, job.hold, job.patience, takeover=job.label == "takeover")
     gate = gate_of(job.label, job.query, setting)
     return rollout(envs, seeds, act or job.driver.start(setting), rules, make_expert(job.env), gate)
@@ -127,14 +130,15 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
     return job.cameras
 
 
-def _load(job: RolloutJob, path: Path, env: Environment) -> LearnedPolicy:
+def _load(job: RolloutJob, path: Path) -> LearnedPolicy:
     from manip_il.learn.policy import LearnedPolicy
 
     driver = job.driver
     trust, device = (driver.trust, driver.device) if isinstance(driver, PolicyDriver) else (False, "cpu")
     checkpoint = Checkpoint.open(path)
-    checkpoint.check_fits(env_spec(job.env, observed_cameras(job)))
-    return LearnedPolicy.load(checkpoint, device, env.task_description, trust=trust)
+    spec = env_spec(job.env, observed_cameras(job))
+    checkpoint.check_fits(spec)
+    return LearnedPolicy.load(checkpoint, device, spec.instruction, trust=trust)
 
 
 def _without_pictures(frame: Transition) -> Transition:

@@ -8,7 +8,6 @@ same for every robot.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -16,10 +15,11 @@ from typing import Literal
 import numpy as np
 
 from manip_il.collect.drivers import Setting, expert_actions, generators, policy_actions
-from manip_il.collect.rollout import Environment, Gate, Labeller, Rules, Turn, rollout
+from manip_il.collect.rollout import Gate, Rules, Turn, rollout
 from manip_il.errors import UnknownName, UsageError
 from manip_il.mdp import F64, Actor, State, Transition
 from manip_il.seeding import rng_for
+from manip_il.worlds.contract import Environment, Expert
 
 LabelMode = Literal["per_state", "takeover", "branch", "last"]
 """What the expert returns when it is queried.
@@ -27,6 +27,7 @@ LabelMode = Literal["per_state", "takeover", "branch", "last"]
 `per_state`: its label. `takeover`: the expert drives to the end, with its own horizon. `branch`: the expert drives some
 steps in a copy of the simulator. `last`: only the label of the last state, which tells the phase reached.
 """
+_MOST = 1e6  # largest bound
 _STREAM = "ask"  # random stream; another name would draw other states
 
 
@@ -44,13 +45,12 @@ class Query:
         if self.kind not in RULES:
             raise UnknownName("query rule", self.kind, RULES)
         _, limits = RULES[self.kind]
-        if limits is None and self.bound is not None:
-            raise UsageError(f"query is {self}; expected {self.kind} alone")
-        if limits and not (
-            self.bound is not None and math.isfinite(self.bound) and limits[0] <= self.bound <= limits[1]
-        ):
+        if limits is None:
+            if self.bound is not None:
+                raise UsageError(f"query is {self}; expected {self.kind} alone")
+        elif self.bound is None or not limits[0] <= self.bound <= limits[1]:
             low, high = limits
-            raise UsageError(f"query is {self}; expected {self.kind}:NUMBER, finite and from {low:g} to {high:g}")
+            raise UsageError(f"query is {self}; expected {self.kind}:NUMBER, from {low:g} to {high:g}")
 
     def __str__(self) -> str:
         return self.kind if self.bound is None else f"{self.kind}:{self.bound:g}"
@@ -114,8 +114,8 @@ RULES: dict[str, tuple[Callable[[float, Setting], Gate], tuple[float, float] | N
     "every": (_every, None),
     "one": (_one, None),
     "probability": (_probability, (1e-6, 1.0)),
-    "ensemble": (_ensemble, (0.0, math.inf)),
-    "safety": (_safety, (0.0, math.inf)),
+    "ensemble": (_ensemble, (0.0, _MOST)),
+    "safety": (_safety, (0.0, _MOST)),
 }
 
 
@@ -140,7 +140,7 @@ def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
     return query.start(setting)
 
 
-def labelled(frames: list[Transition], query: Query, expert: Labeller) -> list[Transition]:
+def labelled(frames: list[Transition], query: Query, expert: Expert) -> list[Transition]:
     """Return an episode's frames. If the query is `one`, first have the expert label one random step."""
     if query.kind == "one":
         step = drawn_step(frames[0].seed, len(frames))
@@ -156,7 +156,7 @@ def cut_at_takeover(frames: list[Transition]) -> tuple[list[Transition], int]:
     return frames, own
 
 
-def branch(env: Environment, expert: Labeller, first: State, seed: int, steps: int) -> Iterator[Transition]:
+def branch(env: Environment, expert: Expert, first: State, seed: int, steps: int) -> Iterator[Transition]:
     """Yield the expert's next steps from a state; the last one is `done`."""
     yield from rollout([env], [seed], expert_actions, Rules(steps), expert, first=first)
 

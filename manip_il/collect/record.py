@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.journal import Journal, episode_path, list_seeds, read_journal
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 from manip_il.sim.config import Look
+from manip_il.worlds.table import env_fingerprint, env_spec
 
-_LOG = logging.getLogger(__name__)
 OnEpisode = Callable[[Episode], None]
 MAX_TRIES = 3  # most tries, as a multiple of the requested successes
 
@@ -32,9 +30,8 @@ def collect(
 ) -> Iterator[tuple[Journal, Episode]]:
     """Run the seeds that have no journal in `journals` yet; each finished episode is written at once.
 
-    Yields what `read_journal` returns for each seed, in seed order, as soon as all earlier seeds are done. A seed that
-    repeatedly kills its worker is left out with a warning. on_episode: called when an episode is on disk; an exception
-    in it ends the run, and finished episodes stay on disk.
+    Yields what `read_journal` returns for each seed, in seed order, as soon as all earlier seeds are done. on_episode:
+    called when an episode is on disk; an exception in it ends the run, and finished episodes stay on disk.
     """
     journal = journal_of(journals, job)
     waiting = deque(seeds)
@@ -44,16 +41,12 @@ def collect(
         while waiting and waiting[0] in on_disk:
             yield read_journal(episode_path(journals, waiting.popleft()))
 
-    while waiting:
-        missing = [seed for seed in waiting if seed not in on_disk]
-        for episode in engine.run(job, missing, journal):
-            on_disk.add(episode.seed)
-            if on_episode is not None:
-                on_episode(episode)
-            yield from ready()
+    yield from ready()
+    for episode in engine.run(job, [seed for seed in waiting if seed not in on_disk], journal):
+        on_disk.add(episode.seed)
+        if on_episode is not None:
+            on_episode(episode)
         yield from ready()
-        if waiting:
-            _LOG.warning("seed %d is left out: it repeatedly killed its worker", waiting.popleft())
 
 
 def collect_successes(

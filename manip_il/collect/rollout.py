@@ -10,15 +10,10 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from manip_il.collect.expert import Expert
 from manip_il.errors import ManipError
 from manip_il.mdp import F64, Actor, Label, Observation, State, Transition
-from manip_il.sim.env import ManipEnv
-from manip_il.sim.world import World
-from manip_il.tasks.stock.envs import StockEnvironment, StockLabeller
+from manip_il.worlds.contract import Environment, Expert
 
-Environment = ManipEnv | StockEnvironment
-Labeller = Expert | StockLabeller
 GROWTH = 0.01  # smallest increase of a task's progress, in [0, 1], that counts
 
 
@@ -26,17 +21,17 @@ GROWTH = 0.01  # smallest increase of a task's progress, in [0, 1], that counts
 class Turn:
     """One running episode at one step, as a driver sees it. label: None if the expert was not queried.
 
-    world: the environment's world, if it has one, in this state until the turn ends.
+    environment: it is in this state until the turn ends.
     """
 
     seed: int
     step: int
     observation: Observation
     state: State
-    labeller: Labeller | None = None
+    expert: Expert | None = None
     label: Label | None = None
     progress: float = 0.0
-    world: World | None = None
+    environment: Environment | None = None
 
     def query(self) -> Label:
         """Return the expert's label of this state and keep it. Raises `ManipError` if there is no expert."""
@@ -46,9 +41,9 @@ class Turn:
 
     def peek(self) -> Label:
         """Return the expert's label of this state without keeping it."""
-        if self.labeller is None:
+        if self.expert is None:
             raise ManipError(f"episode {self.seed}: there is no expert to query at step {self.step}")
-        return self.labeller.label(self.state, self.world)
+        return self.expert.label(self.state, self.environment)
 
 
 Act = Callable[[Sequence[Turn]], list[tuple[F64, Actor]]]
@@ -79,7 +74,7 @@ class _Slot:
     env: Environment
     seed: int
     step: int = 0
-    held: int = 0
+    since_solved: int = 0  # control steps, with the one that solved it
     best: float = -math.inf
     since: int = 0
     taken_over: bool = False
@@ -98,7 +93,7 @@ def rollout(
     seeds: Iterable[int],
     act: Act,
     rules: Rules,
-    labeller: Labeller,
+    expert: Expert,
     gate: Gate | None = None,
     *,
     first: State | None = None,
@@ -112,7 +107,7 @@ def rollout(
     running = [slot for env in envs if (slot := _next_episode(env, waiting, first)) is not None]
     while running:
         for slot in running:
-            _observe(slot, labeller)
+            _observe(slot, expert)
         _choose(running, act, gate, rules.takeover)
         still: list[_Slot] = []
         for slot in running:
@@ -135,10 +130,10 @@ def _next_episode(env: Environment, seeds: Iterator[int], first: State | None) -
     return _Slot(env, seed)
 
 
-def _observe(slot: _Slot, labeller: Labeller) -> None:
+def _observe(slot: _Slot, expert: Expert) -> None:
     env = slot.env
     seen, state = env.observe(), env.get_state()
-    slot.turn = Turn(slot.seed, slot.step, seen, state, labeller, progress=env.progress, world=env.world)
+    slot.turn = Turn(slot.seed, slot.step, seen, state, expert, progress=env.progress, environment=env)
 
 
 def _choose(running: Sequence[_Slot], act: Act, gate: Gate | None, takeover: bool) -> None:
@@ -159,25 +154,25 @@ def _choose(running: Sequence[_Slot], act: Act, gate: Gate | None, takeover: boo
 
 def _advance(slot: _Slot, rules: Rules) -> Transition:
     action, actor = slot.chosen
-    executed = slot.env.advance(action)
-    if actor == Actor.EXPERT and executed is not action:
+    outcome = slot.env.step(action)
+    if actor == Actor.EXPERT and outcome.executed is not action:
         actor = Actor.NOISY_EXPERT
     slot.step += 1
-    solved = slot.env.solved
-    slot.held += slot.held > 0 or solved
-    done = slot.step >= (2 if slot.taken_over else 1) * rules.horizon
-    done |= rules.hold is not None and slot.held > rules.hold
-    done |= rules.patience is not None and not slot.held and slot.is_stuck(rules.patience)
+    if outcome.solved or slot.since_solved:
+        slot.since_solved += 1
+    horizon = 2 * rules.horizon if slot.taken_over else rules.horizon
+    has_ended = rules.hold is not None and slot.since_solved > rules.hold
+    gives_up = rules.patience is not None and not slot.since_solved and slot.is_stuck(rules.patience)
     return Transition(
         seed=slot.seed,
         step=slot.step - 1,
         state=slot.turn.state,
         observation=slot.turn.observation,
         label=slot.turn.label,
-        executed_action=executed,
+        executed_action=outcome.executed,
         actor=actor,
-        reward=slot.env.reward,
-        success=solved,
-        done=done,
+        reward=outcome.reward,
+        success=outcome.solved,
+        done=slot.step >= horizon or has_ended or gives_up,
         progress=slot.turn.progress,
     )

@@ -30,7 +30,6 @@ from manip_il.mdp import Episode
 if TYPE_CHECKING:
     from manip_il.collect.ray_pool import RayPool
 
-MOST_DEATHS = 3  # the run fails when this many seeds in a row kill their worker
 Backend = Literal["local", "ray"]
 Seeds = tuple[int, ...]
 Pool = Union["LocalPool", "RayPool"]
@@ -41,30 +40,27 @@ class Engine:
     """Runs rollout jobs; use as a context manager. Workers live as long as the engine.
 
     workers: processes, 1 for this process alone; on Ray the number of concurrent tasks; None for one per core.
-    given_up: seeds that were left out because they killed a worker that ran them alone.
     """
 
     def __init__(self, workers: int | None = 1, backend: Backend = "local"):
         if workers is not None and workers < 1:
             raise UsageError(f"workers is {workers}; expected at least 1")
         self.workers = default_workers() if workers is None and backend == "local" else workers
-        self.given_up: list[int] = []
         self._backend: Backend = backend
         self._pool: Pool | None = None
 
     def run(self, job: RolloutJob, seeds: Sequence[int], journal: Journal | None = None) -> Iterator[Episode]:
         """Yield one episode per seed, in no fixed order, when it has ended and is in the journal.
 
-        Episodes from other processes come without pictures. Raises what the job raises, and `ManipError` if workers
-        keep dying without finishing an episode.
+        Episodes from other processes come without pictures. Raises what the job raises, and `ManipError` if a seed
+        that ran alone kills its worker.
         """
-        wanted = [seed for seed in seeds if seed not in self.given_up]
-        if self._backend == "local" and (self.workers == 1 or (len(wanted) == 1 and self._pool is None)):
-            yield from run_seeds(job, wanted, journal)
+        if self._backend == "local" and (self.workers == 1 or (len(seeds) == 1 and self._pool is None)):
+            yield from run_seeds(job, seeds, journal)
             return
         self._pool = self._pool or self._open()
         try:
-            for episodes in self._results(self._pool, job, wanted, journal):
+            for episodes in self._results(self._pool, job, seeds, journal):
                 yield from episodes
         except BaseException:
             self._close()  # running episodes are no longer needed
@@ -97,8 +93,8 @@ class Engine:
         self, pool: Pool, job: RolloutJob, seeds: Sequence[int], journal: Journal | None
     ) -> Iterator[list[Episode]]:
         """Yield the tasks' results; seeds of a worker that died run again, one by one."""
-        tasks, running = split(job, seeds, pool.count), dict[Future[list[Episode]], Seeds]()
-        failed = 0  # seeds given up in a row
+        tasks = split(job, seeds, pool.count)
+        running = dict[Future[list[Episode]], Seeds]()
         while tasks or running:
             while tasks and len(running) < pool.count:
                 task = tasks.popleft()
@@ -112,20 +108,14 @@ class Engine:
                 if isinstance(future.exception(), BrokenExecutor):
                     lost += task
                 else:
-                    failed = 0
                     yield future.result()
             for seed in lost:
                 try:
                     yield pool.submit(job, (seed,), journal).result()
-                    failed = 0
                 except BrokenExecutor:
-                    self.given_up.append(seed)
-                    failed += 1
-                if failed == MOST_DEATHS:
                     raise ManipError(
-                        f"rollout workers keep dying, on seeds {self.given_up[-failed:]}; out of memory? "
-                        "Finished episodes are kept"
-                    )
+                        f"seed {seed} killed its worker twice (out of memory?); finished episodes are kept"
+                    ) from None
 
 
 class LocalPool:

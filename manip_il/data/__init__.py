@@ -1,6 +1,6 @@
 """Episodes on disk: columns, journals and LeRobot v3.0 datasets.
 
-`schema.py` lists the columns; its `RobotTaskSpec` holds the names, sizes and rate that a dataset, a policy and an
+`schema.py` lists the columns; its `EnvironmentSpec` holds the names, sizes and rate that a dataset, a policy and an
 environment must share. `episodes.py` turns transitions into an `Episode` with these columns.
 
 `journal.py` writes a journal, one MCAP file, as soon as an episode ends. `lerobot_write.py` writes datasets

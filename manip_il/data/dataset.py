@@ -42,7 +42,7 @@ _NUMBERED = (layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
 class Own:
     """Content of `meta/manip_il.json`: the spec, the environment's fingerprint, and the origin of the episodes."""
 
-    spec: s.RobotTaskSpec
+    spec: s.EnvironmentSpec
     fingerprint: Mapping[str, Any]
     provenance: Mapping[str, Any]
 
@@ -115,7 +115,7 @@ class Dataset:
             return None
         with reading(path):
             ours = checks.read_json(path, "manip_il's description of a dataset")
-            spec = s.RobotTaskSpec.from_json(ours["spec"])
+            spec = s.EnvironmentSpec.from_json(ours["spec"])
             return Own(spec, dict(ours["fingerprint"]), dict(ours["provenance"]))
 
     @property
@@ -129,7 +129,7 @@ class Dataset:
         return self.own.provenance if self.own else {}
 
     @cached_property
-    def spec(self) -> s.RobotTaskSpec:
+    def spec(self) -> s.EnvironmentSpec:
         """The dataset's spec.
 
         For datasets of other programs, and after LeRobot's tools have dropped our file, it is derived from LeRobot's
@@ -149,7 +149,7 @@ class Dataset:
         if len(sizes) > 1:  # a spec has one size for all cameras
             cameras = []
         robot: dict[str, Any] = {**s.robot_of(self.info.robot or UNKNOWN_ROBOT)}
-        return s.RobotTaskSpec(
+        return s.EnvironmentSpec(
             **robot,
             task=UNKNOWN_TASK,
             fps=self.fps,

@@ -23,9 +23,10 @@ from manip_il import checks
 from manip_il.data import foxglove
 from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec, exact_rate
+from manip_il.data.schema import IMAGES, check_same_spec, exact_rate
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
+from manip_il.worlds.contract import EnvironmentSpec
 
 _FORMAT = "2"
 _RECORD = "manip_il"  # name of our metadata record
@@ -38,7 +39,7 @@ class Journal:
     """A folder of journals of one environment."""
 
     folder: Path
-    spec: RobotTaskSpec
+    spec: EnvironmentSpec
     fingerprint: dict[str, Any]
 
     def encode(self, episode: Episode) -> bytes:
@@ -129,7 +130,7 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
             break
     if (found := str(values.pop("format", None))) != _FORMAT:
         raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
-    spec = RobotTaskSpec.from_json(values.pop("spec"))
+    spec = EnvironmentSpec.from_json(values.pop("spec"))
     journal = Journal(folder, spec, values.pop("fingerprint"))
     del values["frames"]
     pictures = foxglove.read_images(stream, spec.cameras)

@@ -27,7 +27,7 @@ from manip_il.data.dataset import EpisodeData, Own
 from manip_il.data.info import PICTURES, Info, read_info, reading
 from manip_il.data.ownership import DATASET
 from manip_il.data.parquet_files import Column, ParquetFiles, to_table
-from manip_il.data.schema import RobotTaskSpec, features, plain_rate
+from manip_il.data.schema import features
 from manip_il.data.statistics import (
     Statistics,
     column_statistics,
@@ -39,6 +39,7 @@ from manip_il.data.video import CameraFiles
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
+from manip_il.worlds.contract import EnvironmentSpec, plain_rate
 
 _GROUP_ROWS = 1_000  # frames per row group
 _GROUP_EPISODES = 100  # episodes per row group of meta/episodes
@@ -48,7 +49,7 @@ _FORMAT = 1  # version of meta/manip_il.json
 def write_dataset(
     episodes: Iterable[Episode],
     root: Path,
-    spec: RobotTaskSpec,
+    spec: EnvironmentSpec,
     provenance: Mapping[str, Any] | None = None,
     *,
     fingerprint: Mapping[str, Any],

@@ -19,20 +19,19 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
 from manip_il.evaluation.tables import INTERVAL, Table
 from manip_il.mdp import Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.events import Perturbation, kinds_for
-from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.stock.table import ROBOTS as STOCK
 from manip_il.tasks.table import get_task
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import env_fingerprint, env_spec
 
 FILE_NAME = "certificate.json"
 NOISE = 0.1  # standard deviation of the actions' noise, as a share of their range
@@ -125,9 +124,8 @@ class Certificate:
 
 
 def count_episodes(env: EnvConfig, cases: int) -> int:
-    """Return the largest number of episodes that `certify` runs. Raises `UsageError` for a stock environment."""
-    if env.robot in STOCK:
-        raise UsageError(f"{env.robot} is a stock environment, whose states cannot be perturbed; choose another robot")
+    """Return the largest number of episodes that `certify` runs. Raises `Unable` if its states cannot be perturbed."""
+    env_spec(env).require("perturbed", "choose another robot")
     return cases * (2 + len(kinds_for(get_task(env.task))))
 
 

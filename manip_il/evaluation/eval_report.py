@@ -14,15 +14,13 @@ from manip_il.evaluation.report import Film, Report, Section
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.side import Side
 from manip_il.evaluation.tables import BASELINE, INTERVAL, Table
-from manip_il.tasks.stock import table as stock
+from manip_il.worlds.table import world_of
 
 
 def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = "") -> Report:
     """Return the report of an evaluation. no_films: why there are no films, or empty."""
     settings, success = result.settings, result.success
-    solved = f"an error of at most {100 * settings.tolerance:g} cm for {settings.success_steps} control steps in a row"
-    if result.robot in stock.ROBOTS:
-        solved = "as the environment itself reports it"
+    solved = world_of(result.robot).success(settings.tolerance, settings.success_steps)
     end = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
     note = f"Episodes have at most {settings.horizon:,} control steps. Success: {solved}{end}."
     if result.until_width is not None:

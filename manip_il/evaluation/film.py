@@ -21,8 +21,9 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import Progress
 from manip_il.mdp import Episode
 from manip_il.sim.config import FILM, CameraConfig
-from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.contract import Unable
+from manip_il.worlds.table import env_spec
 
 FILM_EVERY = 2  # control steps per frame of film
 _SIZE = (240, 320)  # height and width [pixels]
@@ -37,7 +38,9 @@ def run_states(job: RolloutJob, seed: int) -> Episode:
 def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str = "") -> Film:
     """Return a film of an episode. Raises `RenderError` without off-screen OpenGL."""
     states = episode.columns[schema.SIM_STATE][::FILM_EVERY]
-    camera = next(iter(STOCK[env.robot].cameras if env.robot in STOCK else ()), "front")
+    spec = env_spec(env)
+    spec.require("drawn", "there is no film of it")
+    camera = spec.default_cameras[0]
     pictures = render_states(env, CameraConfig((camera,), *_SIZE, FILM), states)
     frames = list(pictures[schema.IMAGES + camera])
     return Film(title, encode_mp4(frames, env.control_hz // FILM_EVERY or 1), caption)
@@ -50,7 +53,7 @@ def collect_films(made: Iterable[Film], progress: Progress) -> tuple[list[Film],
         for film in made:
             films.append(film)
             progress.step()
-    except RenderError as error:
+    except (RenderError, Unable) as error:
         _LOG.warning("the report has no films: %s", error)
         return [], str(error)
     finally:

@@ -17,7 +17,8 @@ from manip_il.evaluation.intervals import CONFIDENCE, Proportion
 from manip_il.option import NameOrPath
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.shape import stored
-from manip_il.tasks.config import EnvConfig, complete
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import complete
 
 if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob

@@ -29,8 +29,8 @@ from manip_il.sim.config import CAMERAS, FILM
 from manip_il.sim.render import framed_picture
 from manip_il.sim.scene import PREFIX
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import scene_of
+from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.table import make_config
 
 FILE_NAME = "check.json"
 SOLVES = 0.9  # share of clean episodes that the expert must solve if a task is to count as possible

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,6 @@ import numpy as np
 
 from manip_il.caching import PerThread
 from manip_il.collect.drivers import ExpertDriver, PolicyDriver
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
@@ -28,12 +26,9 @@ from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import F64, Episode, State
 from manip_il.sim.conditions import NOMINAL, Condition, draw, turn_of
 from manip_il.sim.world import World
-from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.envs import config_scene
-from manip_il.tasks.stock.envs import described_stock
-from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import described_env, env_fingerprint, env_spec
 
-_LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps for which an episode continues after success, to see whether success lasts
 CHECK_EVERY = 100  # number of episodes between checks of the interval's width
 EPISODES_FILE = "episodes.jsonl"
@@ -70,8 +65,6 @@ def evaluate(
 ) -> EvalResult:
     """Run `job` on every seed, to the horizon unless the job has a `hold`; episodes are in the order of `seeds`.
 
-    A seed that repeatedly kills its worker is skipped with a warning.
-
     Args:
         engine: What runs the episodes.
         job: The rollouts.
@@ -95,8 +88,6 @@ def evaluate(
             low, high = Proportion.of([result.success for result in results.values()], sequential=True).interval
             if high - low <= until_width:
                 break
-    if lost := [seed for seed in asked if seed not in results]:
-        _LOG.warning("left out of the evaluation, as each repeatedly killed its worker: seeds %s", lost)
     spec = env_spec(job.env)
     return EvalResult(
         policy=name,
@@ -113,11 +104,10 @@ def evaluate(
 def episode_hold(env: EnvConfig, hold: int | None = HOLD) -> int | None:
     """Return the control steps after success at which an episode ends, None if it continues to the horizon.
 
-    `hold` does not apply to stock environments, which define this themselves.
+    `hold` does not apply to environments that define this themselves.
     """
-    if env.robot not in STOCK:
-        return hold
-    return 0 if STOCK[env.robot].ends_solved else None
+    ends = env_spec(env).ends_solved
+    return hold if ends is None else 0 if ends else None
 
 
 def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
@@ -149,18 +139,9 @@ def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
 
     The hand is named `hand`. The first object that the arm must reach is named `object`.
     """
-    state = State.from_vector(sim_state)
-    if env.robot in STOCK:
-        stock = described_stock(env.robot, env.task)
-        stock.set_state(state)
-        found = stock.positions
-    else:
-        world = _world(config_scene(env))
-        world.restore(state.physics, state.variation)
-        first = world.scene.task.objects_in(world)[:1]
-        found = {"hand": world.ee.position}
-        found |= {"object" if name in first else name: world.pose(name).position for name in world.scene.objects}
-    return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
+    world = described_env(env)
+    world.set_state(State.from_vector(sim_state))
+    return {name: [round(float(value), 4) for value in at] for name, at in world.positions().items()}
 
 
 def measure(

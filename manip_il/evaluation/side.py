@@ -18,7 +18,7 @@ from manip_il.evaluation.results import FILE_NAME, EvalResult, require_equal
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
 from manip_il.evaluation.runner import FOLDER, Progress, Trial
 from manip_il.evaluation.tables import DAGGER
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 _SEED_FOLDER = re.compile(r"seed_(\d+)")
 

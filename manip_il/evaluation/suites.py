@@ -8,8 +8,8 @@ from pathlib import Path
 from manip_il import checks
 from manip_il.errors import UnknownName, UsageError
 from manip_il.sim.conditions import Condition, merged
-from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import world_of
 
 SUITES = {
     "nominal": ("nominal",),
@@ -29,8 +29,10 @@ def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Conditi
     (`sees`). Limits the objects' sizes to those that the task allows. Raises `UnknownName` for an unknown suite,
     `UsageError` for an invalid file or if no condition is left.
     """
-    asked = (_for_task(read_condition(name), env, sees=sees) for name in SUITES.get(suite, (suite,)))
-    left = tuple(condition for condition in asked if condition is not None)
+    asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
+    world = world_of(env.robot)
+    affecting = (world.affecting(env, condition, sees=sees) for condition in asked)
+    left = tuple(condition for condition in affecting if condition is not None)
     if not left:
         blind = "" if sees else " and a policy without cameras"
         raise UsageError(f"--suite={suite} changes nothing for {env.task}{blind}; choose another suite")
@@ -46,7 +48,8 @@ def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Conditi
         return ()
     if odd := next((name for name in names if name not in CONDITIONS[1:] and not name.endswith(_YAML)), None):
         raise UnknownName("--vary", odd, CONDITIONS[1:])
-    kept = _for_task(merged([read_condition(name) for name in names]), env, sees=sees)
+    asked = merged([read_condition(name) for name in names])
+    kept = world_of(env.robot).affecting(env, asked, sees=sees)
     if kept is None:
         raise UsageError(f"--vary={','.join(names)} changes nothing for {env.task}{'' if sees else ' without cameras'}")
     return (kept,)
@@ -64,13 +67,3 @@ def read_condition(name: str) -> Condition:
     if not isinstance(tree, dict | None):
         raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges")
     return Condition(path.stem, **{str(key): value for key, value in (tree or {}).items()})
-
-
-def _for_task(condition: Condition, env: EnvConfig, *, sees: bool) -> Condition | None:
-    """Return the part of a condition that affects an environment, see `Condition.for_world`."""
-    from manip_il.tasks.table import get_task  # imported here: a wrong name is reported before the simulator loads
-
-    if env.robot in STOCK:  # stock environments take no ranges
-        return None if condition.ranges else condition
-    task = get_task(env.task, env.object)
-    return condition.for_world(has_object=bool(task.objects), sees=sees, sizes=task.sizes)

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import rerun
 
-from manip_il.collect.environments import env_spec
 from manip_il.collect.rollout import Act, Turn
 from manip_il.data import schema
 from manip_il.mdp import F64, Actor, Transition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import phases
 from manip_il.sim.window import Clock, Window
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import env_spec
 
 FRAME = "frame"  # timeline: control steps since the first episode began
 _JPEG_QUALITY = 90

@@ -12,7 +12,7 @@ two arms there are two openings, each the last number of its arm.
 
 `ee_delta` is a translation [m] and a rotation vector [rad] in the world frame, not the hand's: objects and goals are
 observed in the world frame, so that a motion towards an object has the same numbers for any orientation of the hand,
-and stock environments (robosuite's OSC_POSE, gymnasium-robotics) use the same convention. It is as long as the robot's
+and benchmarks (robosuite's OSC_POSE, gymnasium-robotics) use the same convention. It is as long as the robot's
 action, so that the network's output fits the environment; the numbers between the first six and the opening are 0 and
 are ignored. The arm needs at least six joints. Decoding finds q* near q with FK(q*) = (p + dp, exp(dR) R)
 (`ArmIK.moved`). It recovers the pose up to rounding, but not the joints: an arm with seven joints can move its elbow
@@ -40,13 +40,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.caching import cached_per_thread
-from manip_il.data.schema import GRIPPERS, JOINT_TARGETS, RobotTaskSpec
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.mdp import F64
 from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import rotation_vector
 from manip_il.robots.table import get_robot
+from manip_il.worlds.contract import GRIPPERS, JOINT_TARGETS, EnvironmentSpec
 
 if TYPE_CHECKING:  # importing inverse kinematics takes a second
     from manip_il.learn.checkpoint import Checkpoint
@@ -124,7 +124,7 @@ class Conversion:
         return get_robot(self.robot)
 
 
-def conversion_for(space: str, spec: RobotTaskSpec, start: Checkpoint | None = None) -> Conversion:
+def conversion_for(space: str, spec: EnvironmentSpec, start: Checkpoint | None = None) -> Conversion:
     """Return the conversion to a space for data of `spec`. start: the checkpoint that a fit continues from, if any.
 
     Raises `MismatchError` for a space other than `joint_target` if the data's actions are not joint targets, and for

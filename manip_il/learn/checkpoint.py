@@ -17,10 +17,11 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.data.fingerprint import policy_sha256
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, MUST_AGREE, STATE, RobotTaskSpec, check_same_spec
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, MUST_AGREE, STATE, check_same_spec
 from manip_il.errors import ManipError, MismatchError, UnknownName
 from manip_il.learn.names import ACTION_SPACES, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
 from manip_il.sim.config import CameraConfig, Look
+from manip_il.worlds.contract import EnvironmentSpec
 
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
@@ -50,7 +51,7 @@ class Origin:
 
     robot: str
     task: str
-    fps: float  # as in `RobotTaskSpec`
+    fps: float  # as in `EnvironmentSpec`
     joint_names: tuple[str, ...]
     environment_state_names: tuple[str, ...]
     action_meaning: str
@@ -62,7 +63,7 @@ class Origin:
     look: dict[str, Any] | None = None
     datasets: list[dict[str, Any]] = field(default_factory=list)
     action_space: str | None = None
-    object: str = ""  # see `RobotTaskSpec`
+    object: str = ""  # see `EnvironmentSpec`
 
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
@@ -74,7 +75,7 @@ class Origin:
     @classmethod
     def of(
         cls,
-        spec: RobotTaskSpec,
+        spec: EnvironmentSpec,
         fingerprint: Mapping[str, Any] | None = None,
         options: Mapping[str, Any] | None = None,
         observation: str = "state",
@@ -98,7 +99,7 @@ class Origin:
         """Return the content of `manip_il.json`."""
         return {name: value for name, value in asdict(self).items() if value or name != "object"}
 
-    def check_fits(self, spec: RobotTaskSpec) -> None:
+    def check_fits(self, spec: EnvironmentSpec) -> None:
         """Raise `MismatchError` naming both sides unless states and actions mean the same as in `spec`."""
         names, seen = spec.environment_state_names, self.observation != "images"
         other_task = seen and self.environment_state_names != names and self.task != spec.task
@@ -220,7 +221,7 @@ class Checkpoint:
             return None
         return {name: self.config[name] for name in ("type", *_MLP_SHAPE)}
 
-    def check_fits(self, spec: RobotTaskSpec) -> None:
+    def check_fits(self, spec: EnvironmentSpec) -> None:
         """Raise `MismatchError` naming both sides unless environments of `spec` have the policy's inputs and action."""
         if self.origin is not None:
             self.origin.check_fits(spec)

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, GRIPPERS, IMAGES, OPENINGS, SERVOS, STATE, TWO_ARMS
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError
 from manip_il.learn.action_spaces import LAST
 from manip_il.learn.batches import to_float
@@ -27,6 +27,7 @@ from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.mdp import F32, Images
+from manip_il.worlds.contract import GRIPPERS, OPENINGS, SERVOS, TWO_ARMS
 
 TOLERANCE = 1e-5  # largest difference between the actions of the file and of the checkpoint [rad] or [m]
 SERVO_TOLERANCE = 1e-3  # largest difference for robots in servos' units [degrees]

@@ -20,12 +20,13 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, JOINT_TARGETS, OPENINGS, STATE
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.checkpoint import require_trust
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import CONVERTED, JOINT_TARGET, OWN_SPACE
 from manip_il.learn.network import require_device
+from manip_il.worlds.contract import JOINT_TARGETS, OPENINGS
 
 PLUGINS = ("manip_il.learn.mlp", "manip_il.learn.cnn")
 # Options of LeRobot's policies that concern its Hub, its commands or one machine, and one without effect.

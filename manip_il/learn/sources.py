@@ -14,11 +14,12 @@ import numpy as np
 
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.info import Info
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec, check_same_spec
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, check_same_spec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import MLP
 from manip_il.mdp import F64, I64
+from manip_il.worlds.contract import EnvironmentSpec
 
 
 def row_weights(datasets: Sequence[Dataset], shares: Sequence[float], rows: I64) -> F64:
@@ -31,7 +32,7 @@ def row_weights(datasets: Sequence[Dataset], shares: Sequence[float], rows: I64)
 
 
 def check_same_sources(
-    roots: Sequence[Path], specs: Sequence[RobotTaskSpec], *, pictures: bool, language: bool
+    roots: Sequence[Path], specs: Sequence[EnvironmentSpec], *, pictures: bool, language: bool
 ) -> None:
     """Raise `MismatchError` naming both sides unless datasets can be used as one.
 

@@ -14,18 +14,16 @@ from gymnasium.vector import VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE
 from manip_il.errors import UnknownName, UsageError, silence_ffmpeg_warning
 from manip_il.learn.names import OBSERVATIONS
 from manip_il.option import NameOrPath, option_of, typed
-from manip_il.robots.table import get_robot
 from manip_il.sim.config import CAMERAS, CameraConfig
-from manip_il.sim.env import ManipEnv, environment_state_names
+from manip_il.sim.env import ManipEnv
 from manip_il.tasks import ENV_IDS, TASK_IDS
-from manip_il.tasks.config import EnvConfig as SimConfig
-from manip_il.tasks.config import complete
-from manip_il.tasks.envs import scene_of
-from manip_il.tasks.table import get_task
+from manip_il.worlds.config import EnvConfig as SimConfig
+from manip_il.worlds.ladder.envs import parts_of
+from manip_il.worlds.table import complete, env_spec
 
 TASKS = {env_id.removeprefix("manip_il/"): names for env_id, names in ENV_IDS.items()}
 ANY_ROBOTS = {env_id.removeprefix("manip_il/"): task for env_id, task in TASK_IDS.items()}
@@ -121,19 +119,18 @@ class ManipILEnv(EnvConfig):
 
     def _features(self) -> dict[str, PolicyFeature]:
         """Return the features by observation name, but cameras by column, as LeRobot's recorder requires."""
-        simulation, cameras = self._simulation(), self._cameras()
-        joints = (len(get_robot(simulation.robot).joint_names),)
+        cameras = self._cameras()
+        spec = env_spec(self._simulation(), cameras)
+        joints = (len(spec.joint_names),)
         features = {
             ACTION: PolicyFeature(FeatureType.ACTION, joints),
             "agent_pos": PolicyFeature(FeatureType.STATE, joints),
         }
         if self.observation != "images":
-            size = len(environment_state_names(scene_of(simulation.robot, simulation.task, simulation.object)))
-            features["environment_state"] = PolicyFeature(FeatureType.ENV, (size,))
-        if cameras is not None:
-            picture = PolicyFeature(FeatureType.VISUAL, (*cameras.size, 3))
-            features |= {IMAGES + name: picture for name in cameras.names}
-        return features
+            size = (len(spec.environment_state_names),)
+            features["environment_state"] = PolicyFeature(FeatureType.ENV, size)
+        picture = PolicyFeature(FeatureType.VISUAL, (*spec.image_size, 3))
+        return features | dict.fromkeys(spec.image_keys, picture)
 
 
 def _given(text: NameOrPath) -> NameOrPath:
@@ -145,8 +142,7 @@ class FilmedEnv(ManipEnv):
     """`ManipEnv` for lerobot-eval, which always films: if `film` is false, its pictures are small and black."""
 
     def __init__(self, config: SimConfig, *, film: bool, cameras: CameraConfig | None, **gymnasiums: Any):
-        task = get_task(config.task, config.object)
-        super().__init__(get_robot(config.robot), task, config, cameras=cameras, render_mode="rgb_array", **gymnasiums)
+        super().__init__(*parts_of(config), config, cameras=cameras, render_mode="rgb_array", **gymnasiums)
         self._film = film
 
     @override

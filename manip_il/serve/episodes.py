@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from manip_il.collect.edits import SERVED
-from manip_il.collect.environments import env_fingerprint, env_spec
-from manip_il.collect.expert import Expert
 from manip_il.data.build import Recording
 from manip_il.data.episodes import to_episode
 from manip_il.data.journal import Journal, list_seeds
@@ -19,8 +17,10 @@ from manip_il.errors import UsageError
 from manip_il.mdp import Actor, Transition
 from manip_il.seeding import BLOCK, stream_seeds
 from manip_il.serve.station import Mover, Read, Station
-from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.envs import env_of
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.ladder.expert import LadderExpert
+from manip_il.worlds.table import env_fingerprint, env_spec
 
 
 class ServedEpisodes:
@@ -34,7 +34,7 @@ class ServedEpisodes:
         self._station = station
         self._env = env_of(config)
         self._leader = leader
-        self._expert = Expert(self._env.scene)
+        self._expert = LadderExpert(self._env.scene)
         self.driver = Actor.EXPERT
         self._reads: list[tuple[Read, Actor]] | None = None
         self._journal = Journal(folder, env_spec(config), env_fingerprint(config)) if folder is not None else None

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from manip_il.collect.drivers import policy_actions
-from manip_il.collect.environments import env_spec
 from manip_il.collect.rollout import Turn
 from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import Checkpoint
@@ -28,8 +27,9 @@ from manip_il.serve.station import Mover, Station
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.window import Window
-from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.envs import env_of
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.table import env_spec
 
 Say = Callable[[str], None]
 _UNPACED = 1e6  # a window's frame rate, so high that it never waits: the station keeps real time [Hz]

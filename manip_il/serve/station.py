@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 
 from manip_il import checks
-from manip_il.collect.expert import Expert
 from manip_il.data.atomic import write_file
 from manip_il.errors import UsageError
 from manip_il.mdp import F64, State
@@ -24,6 +23,7 @@ from manip_il.serve.servo import Follower
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.window import Clock
 from manip_il.sim.world import World
+from manip_il.worlds.ladder.expert import LadderExpert
 
 FEETECH = "so_follower"  # LeRobot's `robot_type` of arms with these servos
 HELD = 1.0  # how long the task must stay solved before it counts [s]
@@ -66,7 +66,7 @@ class Station:
         env.world = World(replace(env.scene, model=copy.copy(env.scene.model)))  # a copy, as its motors become servos
         self.env, self._config = env, config
         self._servos = replace(config.servos, **IDEAL) if config.servo == "ideal" else config.servos
-        self._expert = Expert(env.scene)
+        self._expert = LadderExpert(env.scene)
         self._step = 1 / env.config.control_hz  # [s]
         self.clock = Clock(env.config.control_hz * config.speed)
         ranges = env.scene.model.jnt_range[np.isin(env.scene.model.jnt_qposadr, env.scene.arm_q)]
@@ -113,7 +113,7 @@ class Station:
 
         These are the label's joints plus the follower's sag and the offset of its servos.
         """
-        label = self._expert.label(self.env.get_state(), self.env.world)
+        label = self._expert.label(self.env.get_state(), self.env)
         return self.to_joints(label.action) + self.follower.sag() + self.follower.offset if label.valid else None
 
     def reset(self, seed: int) -> None:

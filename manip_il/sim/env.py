@@ -33,7 +33,7 @@ _JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
 
 
 class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
-    """Joint-position control of one arm on one task. `manip_il.tasks.envs.make_env` makes it from names.
+    """Joint-position control of one arm on one task. `manip_il.make_env` makes it from names.
 
     Action: joint position targets and gripper command in the units of `ActionSpace`, (n,), float32. Observation: a dict
     of `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.

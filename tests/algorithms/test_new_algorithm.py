@@ -16,7 +16,7 @@ from manip_il.collect.workers import Engine
 from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Episode
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import make_config
 
 from ..damage import check_same_data
 

@@ -22,7 +22,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Actor, Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import make_config
 
 from ..damage import check_same_data, digests
 from ..learn.tiny_policies import ACT

@@ -7,8 +7,8 @@ import pytest
 
 from manip_il.chapter.episodes import ActionRange, Lockstep, RobotEpisode
 from manip_il.learn.action_spaces import Conversion
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import env_of
+from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.table import make_config
 
 ENV = make_config("fetch", "reach")
 HAND = Conversion("ee_delta", "fetch")

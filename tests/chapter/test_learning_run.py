@@ -14,10 +14,9 @@ from manip_il.algorithms.results import Result, best_validation, validations
 from manip_il.chapter.config import DiscriminatorConfig, LearningConfig, PPOConfig
 from manip_il.chapter.learning import LearningRun, ppo
 from manip_il.cli.main import main
-from manip_il.collect.environments import env_spec
 from manip_il.collect.workers import Engine
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import env_spec, make_config
 
 from ..collect.clones import clone
 from ..damage import digests

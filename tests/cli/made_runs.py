@@ -10,15 +10,15 @@ import numpy as np
 
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.outputs import ResumableOutput, save_options
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data import schema
 from manip_il.data.json_lines import append_line
-from manip_il.data.schema import RobotTaskSpec
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.mdp import Episode
-from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.contract import EnvironmentSpec
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint
@@ -33,7 +33,7 @@ def files(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-def make_episode(spec: RobotTaskSpec, seed: int, length: int) -> Episode:
+def make_episode(spec: EnvironmentSpec, seed: int, length: int) -> Episode:
     """A solved one: right columns, random numbers."""
     rng = np.random.default_rng(seed)
     columns = {}

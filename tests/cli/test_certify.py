@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 
 from manip_il.cli.main import main
-from manip_il.collect.environments import env_fingerprint
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import env_fingerprint, make_config
 
 ENV = make_config("fetch", "reach", horizon=60)
 WORDS = ["robot", "certify", "--robot.type=fetch", "--task.type=reach", "--env.horizon=60", "--cases=2", "--workers=1"]

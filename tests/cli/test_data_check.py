@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.build import build
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..damage import edit_json
 from .made_runs import make_episode

@@ -9,14 +9,13 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.collect.environments import env_spec
 from manip_il.errors import UsageError
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.runner import EPISODES_FILE as KEPT
 from manip_il.evaluation.suites import CONDITIONS, SUITES, suite_conditions
 from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.sim.events import STANDARD
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import env_spec, make_config
 
 from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint

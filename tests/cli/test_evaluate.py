@@ -8,13 +8,12 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data.schema import STATE
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import ManipEnv
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..damage import edit_json
 from ..learn.tiny_policies import edit_config, write_checkpoint

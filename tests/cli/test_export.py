@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.collect.environments import env_spec
 from manip_il.data.fingerprint import policy_sha256
 from manip_il.learn.checkpoint import Origin
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import env_spec, make_config
 
 from ..learn.tiny_policies import write_checkpoint
 

@@ -10,11 +10,11 @@ import pytest
 from manip_il.cli.main import main
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.data.schema import RobotTaskSpec
+from manip_il.worlds.contract import EnvironmentSpec
 
 from .made_runs import make_episode
 
-SPEC = RobotTaskSpec("r", "t", 20, ("a", "b"), ("ee.x",), 3, "do it")
+SPEC = EnvironmentSpec("r", "t", 20, ("a", "b"), ("ee.x",), 3, "do it")
 
 
 @pytest.fixture(scope="module")

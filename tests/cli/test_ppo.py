@@ -10,8 +10,8 @@ import torch
 
 from manip_il.chapter.reward import RewardNetwork, RewardShape, ways_of, write_reward
 from manip_il.cli.main import main
-from manip_il.collect.environments import env_spec
-from manip_il.tasks.config import EnvConfig, make_config
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import env_spec, make_config
 
 from ..collect.clones import clone
 

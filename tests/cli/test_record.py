@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.sim import render
 from manip_il.sim.config import Look
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..pictures import read_episodes
 from .made_runs import files

@@ -20,11 +20,10 @@ import manip_il
 from manip_il.cli.main import load, main
 from manip_il.cli.parsing import parse
 from manip_il.cli.run.learning import imitation_config
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.errors import ManipError
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..damage import digests
 from .made_runs import make_policy

@@ -16,9 +16,8 @@ from manip_il.data import schema
 from manip_il.evaluation.watch import FRAME, slider_actions
 from manip_il.mdp import Episode
 from manip_il.sim.config import CAMERAS
-from manip_il.tasks.config import make_config
-
-from ..scenes import started
+from manip_il.worlds.ladder.world import LadderEnv
+from manip_il.worlds.table import make_config
 
 REACH = ["view", "--task.type=reach"]
 SCALARS, TEXT = "Scalars:scalars", "TextLog:text"
@@ -80,9 +79,11 @@ def test_the_sliders_of_the_window_drive_from_where_an_episode_starts():
     class Window:
         commands = np.zeros(0)
 
-    env, window = started(task="reach"), Window()
+    config = make_config("panda", "reach", horizon=30)
+    env, window = LadderEnv(config, None, ()), Window()
+    env.start(3_000_000)
     scene, start = env.scene, env.data.ctrl.copy()
-    job = RolloutJob(make_config("panda", "reach", horizon=30))
+    job = RolloutJob(config)
     window.commands = start + 0.1
     window.commands[scene.gripper.ctrl] = start[scene.gripper.ctrl]
     window.commands[scene.gripper.ctrl[0]] = 0.03  # one finger: the other one follows

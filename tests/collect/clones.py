@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from manip_il.collect.environments import env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.seeding import stream_seeds
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import env_spec
 
 
 def clone(env: EnvConfig, episodes: int, folder: Path, *, steps: int, width: int = 32, batch_size: int = 32) -> Path:

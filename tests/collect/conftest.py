@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import make_config
 
 from .clones import clone
 

@@ -15,7 +15,7 @@ from manip_il.collect.record import journal_of
 from manip_il.data.journal import Journal, list_episodes
 from manip_il.data.schema import SIM_STATE
 from manip_il.mdp import Episode
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from kept import label_all
 
+from manip_il import Expert
 from manip_il.collect.edits import (
     SERVED,
     EditSource,
@@ -22,8 +23,6 @@ from manip_il.collect.edits import (
     render_dataset,
     render_states,
 )
-from manip_il.collect.environments import env_fingerprint, env_spec, make_expert
-from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.scenes import CHUNK, Scenes
 from manip_il.collect.workers import map_in_order
@@ -37,9 +36,9 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.variation import part
 from manip_il.sim.world import World
-from manip_il.tasks.config import EnvConfig, make_config
-from manip_il.tasks.envs import env_of, scene_of
-from manip_il.tasks.stock.table import ROBOT as STOCK
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.ladder.envs import env_of, scene_of
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config, make_expert
 
 from ..damage import digests
 from ..pictures import read_episodes
@@ -94,7 +93,7 @@ def test_labels_given_afterwards_elsewhere_in_another_order_are_those_given_whil
                 np.testing.assert_array_equal(labels.reshape(episode.columns[key].shape), episode.columns[key])
 
 
-@pytest.mark.parametrize("env", [REACH, make_config(STOCK, "FetchReach-v4")], ids=lambda env: env.robot)
+@pytest.mark.parametrize("env", [REACH, make_config("fetch_stock", "FetchReach-v4")], ids=lambda env: env.robot)
 def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvConfig, tmp_path):
     [first, second] = recorded(env)
     older = {key: first.columns[key].copy() for key in (schema.ACTION, schema.EXPERT_PHASE)}

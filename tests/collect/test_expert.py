@@ -8,18 +8,18 @@ from functools import cache, lru_cache
 import numpy as np
 import pytest
 
+from manip_il import Expert
 from manip_il.collect.drivers import driver_of
-from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob, run_steps
 from manip_il.mdp import Label, State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.world import GOAL, Scene, World
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import env_of, scene_of
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import get_task
+from manip_il.worlds.ladder.envs import env_of, scene_of
+from manip_il.worlds.table import make_config
 
 from ..scenes import sizes_of, started
 from ..tables import every_robot, every_scene, every_scene_with_a_cube

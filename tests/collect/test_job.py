@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from kept import written
 
+from manip_il import Expert
 from manip_il.collect.drivers import ExpertDriver, NoisyExpertDriver, PolicyDriver, RandomDriver
-from manip_il.collect.environments import env_spec
-from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import Query
 from manip_il.data.episodes import parts
@@ -20,8 +19,8 @@ from manip_il.mdp import Actor, Episode, State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.events import STANDARD
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import env_of, scene_of
+from manip_il.worlds.ladder.envs import env_of, scene_of
+from manip_il.worlds.table import env_spec, make_config
 
 from ..learn.tiny_policies import write_checkpoint
 

@@ -9,6 +9,7 @@ import pytest
 
 from manip_il.collect.rollout import Rules, Turn, rollout
 from manip_il.mdp import Actor, Label, Observation, State, Transition
+from manip_il.world import Outcome
 
 GOAL = 3.0
 
@@ -20,18 +21,12 @@ class Counter:
     nothing is solved.
     """
 
-    world, task_description = None, ""
-
     def __init__(self, kick: int = -1, noise: float = 0.0, stuck: int | None = None) -> None:
         self.x, self.steps, self.kick, self.noise, self.stuck = 0.0, 0, kick, noise, stuck
 
     @property
     def solved(self) -> bool:
         return self.x >= GOAL and self.stuck is None
-
-    @property
-    def reward(self) -> float:
-        return float(self.solved)
 
     @property
     def progress(self) -> float:
@@ -42,10 +37,10 @@ class Counter:
     def start(self, seed: int) -> None:
         self.x, self.steps = 0.0, 0
 
-    def advance(self, action: np.ndarray) -> np.ndarray:
+    def step(self, action: np.ndarray) -> Outcome:
         self.x += float(action[0]) + self.noise
         self.steps += 1
-        return action + self.noise if self.noise else action
+        return Outcome(action + self.noise if self.noise else action, float(self.solved), self.solved)
 
     def observe(self) -> Observation:
         self.x -= 5.0 * (self.steps == self.kick)
@@ -61,7 +56,7 @@ class Ones:
     def __init__(self) -> None:
         self.queried: list[int] = []
 
-    def label(self, state: State, world: object | None = None) -> Label:
+    def label(self, state: State, environment: object | None = None) -> Label:
         self.queried.append(state.step)
         return Label(np.array([1.0]), 1, True, 0.0)
 

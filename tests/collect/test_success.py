@@ -11,8 +11,8 @@ from manip_il.collect.job import RolloutJob
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.events import KINDS, Perturbation, kinds_for
-from manip_il.tasks.config import make_config
 from manip_il.tasks.table import TASKS
+from manip_il.worlds.table import make_config
 
 from ..tables import SCENES, WITH_A_CUBE
 

@@ -26,7 +26,7 @@ from manip_il.collect.workers import Engine, map_in_order
 from manip_il.data.journal import list_seeds
 from manip_il.errors import ManipError
 from manip_il.seeding import stream_seeds
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import make_config
 
 from ..faults.child import living
 
@@ -102,23 +102,16 @@ def test_a_policy_acts_the_same_everywhere(engine: Engine, checkpoint):
 
 @pytest.mark.slow
 @both_backends
-def test_a_seed_runs_again_where_its_worker_died_and_after_that_alone_is_left_out(engine: Engine, tmp_path, expected):
+def test_a_seed_runs_again_where_its_worker_died_and_ends_the_run_if_it_dies_alone(engine: Engine, tmp_path, expected):
     (tmp_path / "once").mkdir()
     once = DeadlyJournal.of(tmp_path / "once", JOB, SEEDS[1], times=1)
     assert sorted(episode.seed for episode in engine.run(JOB, SEEDS, once)) == list(SEEDS)
     assert contents(tmp_path / "once" / "journals") == expected
-    assert (once.deaths(), engine.given_up) == (1, [])
+    assert once.deaths() == 1
     journal = DeadlyJournal.of(tmp_path, JOB, SEEDS[2])
-    episodes = list(engine.run(JOB, SEEDS, journal))
-    assert sorted(episode.seed for episode in episodes) == [seed for seed in SEEDS if seed != SEEDS[2]]
+    with pytest.raises(ManipError, match=f"seed {SEEDS[2]} killed its worker twice"):
+        list(engine.run(JOB, SEEDS, journal))
     assert journal.deaths() == 2
-    assert engine.given_up == [SEEDS[2]]
-
-
-@pytest.mark.slow
-def test_where_every_worker_dies_the_work_ends_with_an_error(tmp_path):
-    with Engine(2) as engine, pytest.raises(ManipError, match="rollout workers keep dying"):
-        list(engine.run(JOB, SEEDS, DeadlyJournal.of(tmp_path, JOB, *SEEDS)))
 
 
 @pytest.mark.slow
@@ -142,7 +135,6 @@ def test_nodes_come_and_go(cluster, tmp_path, expected):
             if count == 1:
                 cluster.remove_node(node, allow_graceful=False)
             counts.append(engine._pool.count)
-        assert engine.given_up == []
     assert counts[0] == 3
     assert contents(tmp_path) == expected
 

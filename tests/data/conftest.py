@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from manip_il.data.schema import RobotTaskSpec
 from manip_il.mdp import Episode
+from manip_il.worlds.contract import EnvironmentSpec
 
 from ..pictures import numbered_episodes, with_cameras
 from ..synthetic import episodes, make_episode, offline, spec
@@ -16,12 +16,12 @@ __all__ = ["episodes", "make_episode", "offline", "spec"]
 
 
 @pytest.fixture(scope="session")
-def two(spec: RobotTaskSpec) -> RobotTaskSpec:
+def two(spec: EnvironmentSpec) -> EnvironmentSpec:
     """The spec with two cameras."""
     return with_cameras(spec, "front", "wrist")
 
 
 @pytest.fixture(scope="session")
-def filmed(make_episode: Callable[..., Episode], two: RobotTaskSpec) -> list[Episode]:
+def filmed(make_episode: Callable[..., Episode], two: EnvironmentSpec) -> list[Episode]:
     """Three episodes of 21 frames with numbered pictures of two cameras."""
     return numbered_episodes(make_episode, two)

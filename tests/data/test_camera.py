@@ -51,7 +51,7 @@ def record(root: Path, kind: str, episodes: int) -> None:
 
 @pytest.fixture(scope="module")
 def roots(
-    tmp_path_factory: pytest.TempPathFactory, make_episode: Callable[..., Episode], two: s.RobotTaskSpec
+    tmp_path_factory: pytest.TempPathFactory, make_episode: Callable[..., Episode], two: s.EnvironmentSpec
 ) -> dict[str, Path]:
     """Ours with either codec, in several files; what LeRobot records; what it makes of two by aggregating."""
     from lerobot.datasets.aggregate import aggregate_datasets

@@ -30,7 +30,7 @@ ORIGIN = {"recorded": 3, "failed": 1}
 
 
 @pytest.fixture
-def root(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
+def root(tmp_path: Path, episodes: list[Episode], spec: s.EnvironmentSpec) -> Path:
     write_dataset(episodes, tmp_path / "lift", spec, provenance=ORIGIN, **OPTIONS)
     return tmp_path / "lift"
 

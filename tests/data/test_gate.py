@@ -29,7 +29,7 @@ PICTURE = encoded(np.full((8, 8, 3), 90, np.uint8))
 
 
 @pytest.fixture
-def root(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
+def root(tmp_path: Path, episodes: list[Episode], spec: s.EnvironmentSpec) -> Path:
     """A dataset with a column of pictures, as LeRobot records it: without this program's own file."""
     root = write(episodes, tmp_path / "lift", spec)
     store_pictures(root, KEY, [PICTURE] * sum(map(len, episodes)), (8, 8))
@@ -101,7 +101,9 @@ def test_a_picture_has_the_size_in_info_before_it_is_decoded(root: Path):
     tracemalloc.stop()
 
 
-def test_a_film_has_the_size_in_info_before_it_is_decoded(tmp_path: Path, two: s.RobotTaskSpec, filmed: list[Episode]):
+def test_a_film_has_the_size_in_info_before_it_is_decoded(
+    tmp_path: Path, two: s.EnvironmentSpec, filmed: list[Episode]
+):
     root = write(filmed, tmp_path / "film", two)
     edit_json(root / layout.INFO, lambda info: info["features"][KEY].update(shape=[8, 8, 3]))
     with pytest.raises(ManipError, match=r"72 x 96; expected 8 x 8, as in info\.json"):
@@ -168,7 +170,7 @@ def test_a_files_own_metadata_has_nothing_decoded(root: Path, name: str, kind: s
         check_arrived(root)
 
 
-def test_a_playlist_is_no_video(tmp_path: Path, two: s.RobotTaskSpec, filmed: list[Episode]):
+def test_a_playlist_is_no_video(tmp_path: Path, two: s.EnvironmentSpec, filmed: list[Episode]):
     root = write(filmed, tmp_path / "film", two)
     path = next(root.glob("videos/**/*.mp4"))
     path.write_bytes(b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:1/a.ts\n" + path.read_bytes())

@@ -25,12 +25,12 @@ FRONT = s.IMAGES + "front"
 
 
 @pytest.fixture(scope="module")
-def seen(spec: s.RobotTaskSpec) -> s.RobotTaskSpec:
+def seen(spec: s.EnvironmentSpec) -> s.EnvironmentSpec:
     return with_cameras(spec, "front")
 
 
 @pytest.fixture(scope="module")
-def filmed_once(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, seen: s.RobotTaskSpec) -> Path:
+def filmed_once(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, seen: s.EnvironmentSpec) -> Path:
     return write(numbered_episodes(make_episode, seen), tmp_path_factory.mktemp("filmed") / "victim", seen)
 
 
@@ -41,12 +41,12 @@ def victim(tmp_path: Path, filmed_once: Path) -> Path:
 
 
 @pytest.fixture
-def attack(tmp_path: Path, make_episode: MakeEpisode, seen: s.RobotTaskSpec, monkeypatch: pytest.MonkeyPatch) -> Path:
+def attack(tmp_path: Path, make_episode: MakeEpisode, seen: s.EnvironmentSpec, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Journals whose only camera has a path for its name."""
     plain = numbered_episodes(make_episode, seen, 1)[0]
     columns = {key.replace(FRONT, s.IMAGES + HOSTILE): column for key, column in plain.columns.items()}
     with monkeypatch.context() as patch:  # a spec that another program made up: nothing checks it
-        patch.setattr(s.RobotTaskSpec, "__post_init__", lambda self: None)
+        patch.setattr(s.EnvironmentSpec, "__post_init__", lambda self: None)
         spec = replace(seen, cameras=(HOSTILE,))
     journal.Journal(tmp_path / "lift.journals", spec, {}).write(replace(plain, columns=columns))
     return tmp_path / "lift.journals"
@@ -72,7 +72,7 @@ def test_a_camera_named_as_a_path_overwrites_no_other_dataset(attack, victim, ca
 )
 def test_a_spec_refuses_what_it_cannot_be(spec, change, words):
     with pytest.raises(ManipError) as error:
-        s.RobotTaskSpec.from_json(spec.to_json() | change)
+        s.EnvironmentSpec.from_json(spec.to_json() | change)
     assert words in str(error.value)
     assert len(str(error.value)) < 500
 

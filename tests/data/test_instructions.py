@@ -29,7 +29,7 @@ def told(episodes: list[Episode]) -> list[Episode]:
 
 
 @pytest.fixture
-def root(tmp_path: Path, told: list[Episode], spec: s.RobotTaskSpec) -> Path:
+def root(tmp_path: Path, told: list[Episode], spec: s.EnvironmentSpec) -> Path:
     write_dataset(told, tmp_path / "data", spec, fingerprint={})
     return tmp_path / "data"
 

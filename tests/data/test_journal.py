@@ -48,12 +48,12 @@ def test_an_episode_comes_back_with_its_header_and_gives_the_same_bytes_again(tm
 
 
 @pytest.fixture
-def path(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Path:
+def path(tmp_path: Path, make_episode: MakeEpisode, spec: s.EnvironmentSpec) -> Path:
     return journal.Journal(tmp_path, spec, FINGERPRINT).write(make_episode(17, 4))
 
 
 @pytest.fixture
-def filmed(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Path:
+def filmed(tmp_path: Path, make_episode: MakeEpisode, spec: s.EnvironmentSpec) -> Path:
     spec = with_cameras(spec, "front", "wrist")
     return journal.Journal(tmp_path / "filmed", spec, FINGERPRINT).write(numbered_episodes(make_episode, spec)[0])
 
@@ -102,7 +102,7 @@ from pathlib import Path
 import numpy as np
 from manip_il.data import journal, schema
 from manip_il.mdp import Episode
-spec = schema.RobotTaskSpec("r", "t", 20, ("a", "b"), ("ee.x",), 1, "")
+spec = schema.EnvironmentSpec("r", "t", 20, ("a", "b"), ("ee.x",), 1, "")
 for seed in range(100_000):
     columns = {schema.ACTION: np.full((50, 2), seed, np.float32), schema.SIM_STATE: np.full((50, 60), seed, np.float64)}
     journal.Journal(Path(sys.argv[1]), spec, {}).write(Episode(seed, columns, True, True))

@@ -59,7 +59,7 @@ def pair(request, ours, theirs, films) -> tuple[Path, Path]:
     return (ours, theirs) if request.param == "state" else films
 
 
-def write_by_lerobot(episodes: list[Episode], root: Path, spec: s.RobotTaskSpec) -> Path:
+def write_by_lerobot(episodes: list[Episode], root: Path, spec: s.EnvironmentSpec) -> Path:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     options: dict[str, Any] = {"features": s.features(spec), "robot_type": spec.robot, "use_videos": bool(spec.cameras)}
@@ -70,7 +70,7 @@ def write_by_lerobot(episodes: list[Episode], root: Path, spec: s.RobotTaskSpec)
     return root
 
 
-def add_episode(dataset: Any, episode: Episode, spec: s.RobotTaskSpec) -> None:
+def add_episode(dataset: Any, episode: Episode, spec: s.EnvironmentSpec) -> None:
     shapes = {key: feature["shape"] for key, feature in s.features(spec).items()}
     for frame in range(len(episode)):
         row = {key: values[frame].reshape(shapes[key]) for key, values in episode.columns.items()}
@@ -160,7 +160,7 @@ def test_lerobot_decodes_the_right_pictures(tmp_path, make_episode, two, backend
 
 
 @pytest.fixture(params=[(), ("front",)], ids=["state", "camera"])
-def seen(request, spec) -> s.RobotTaskSpec:
+def seen(request, spec) -> s.EnvironmentSpec:
     return with_cameras(spec, *request.param)
 
 

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from manip_il.data import fingerprint
 from manip_il.data import schema as s
-from manip_il.data.fingerprint import canonical_json, compare_fingerprints, environment_fingerprint
+from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import MismatchError
+from manip_il.worlds import fingerprint
+from manip_il.worlds.fingerprint import canonical_json, environment_fingerprint
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Config:
 
 
 def test_a_spec_survives_json(spec):
-    assert s.RobotTaskSpec.from_json(spec.to_json()) == spec
+    assert s.EnvironmentSpec.from_json(spec.to_json()) == spec
 
 
 def test_one_spec_agrees_with_itself_on_another_task(spec):

@@ -21,7 +21,7 @@ FRONT, SIDE = s.IMAGES + "front", s.IMAGES + "side"
 
 
 @pytest.fixture(scope="module")
-def pictured(spec) -> s.RobotTaskSpec:
+def pictured(spec) -> s.EnvironmentSpec:
     return replace(spec, cameras=("front", "side"), image_size=(32, 48), video=False)
 
 

@@ -41,7 +41,7 @@ FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory, filmed: list[Episode], two: s.RobotTaskSpec) -> Path:
+def root(tmp_path_factory: pytest.TempPathFactory, filmed: list[Episode], two: s.EnvironmentSpec) -> Path:
     return write(filmed, tmp_path_factory.mktemp("filmed") / "lift", two)
 
 

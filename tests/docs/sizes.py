@@ -10,7 +10,7 @@ import yaml
 
 from manip_il.cli.main import load
 from manip_il.cli.options import options_of
-from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.worlds.config import WORLDS
 
 from .pages import command_of
 
@@ -128,7 +128,7 @@ def _value(option: str, words: Iterable[str]) -> str:
 
 def _is_stock(words: Iterable[str]) -> bool:
     """Whether the environment is a stock one, whose horizon is fixed or what its expert needs."""
-    return _value("robot.type", words) in STOCK
+    return _value("robot.type", words) in WORLDS
 
 
 def _policy_in_config(words: Iterable[str]) -> str:

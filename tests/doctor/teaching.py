@@ -12,9 +12,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.data import schema as s
 from manip_il.data.build import build
-from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import Journal
 from manip_il.mdp import Episode
+from manip_il.worlds.fingerprint import environment_fingerprint
 
 EPISODES, SIZE, CAMERAS = 12, (48, 64), ("front", "wrist")
 NAMES = ("pan", "lift", "elbow", "wrist", "gripper")
@@ -70,7 +70,7 @@ def _write_ours(root: Path, episodes: list[Columns], fps: int) -> Path:
     """A dataset beside its journals, of this program's own writer."""
     cameras, size = (CAMERAS, SIZE) if len(episodes[0]) > 2 else ((), (0, 0))
     about = ("arm", "put", fps, NAMES, ("object.x", "object.y"), 7, "Put it there.")
-    spec = s.RobotTaskSpec(*about, cameras=cameras, image_size=size)
+    spec = s.EnvironmentSpec(*about, cameras=cameras, image_size=size)
     journal = Journal(root.with_name(f"{root.name}.journals"), spec, environment_fingerprint(b"", {}))
     for seed, columns in enumerate(episodes):
         length, rng = len(columns[s.STATE]), np.random.default_rng(seed)

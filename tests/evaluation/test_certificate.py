@@ -7,14 +7,13 @@ import json
 import numpy as np
 import pytest
 
-from manip_il.collect.environments import env_fingerprint
-from manip_il.collect.expert import Expert
+from manip_il import Expert
 from manip_il.collect.workers import Engine
 from manip_il.evaluation.certify import Case, Certificate, Row, certify, count_episodes, draw_moment
 from manip_il.evaluation.intervals import wilson_interval
 from manip_il.sim.events import Perturbation
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import make_env, scene_of
+from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.table import env_fingerprint, make_config
 
 HORIZON = 50
 SETTINGS = {"cases": 4, "seed": 0, "horizon": HORIZON, "control_hz": 20, "tolerance": 0.02, "success_steps": 5}

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import pytest
 
 from manip_il.collect.drivers import PolicyDriver, RandomDriver
-from manip_il.collect.environments import env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.evaluation import runner
@@ -17,7 +16,7 @@ from manip_il.evaluation.runner import evaluate
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL, turn_of
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import env_spec, make_config
 
 from ..collect.clones import clone
 from ..learn.tiny_policies import write_checkpoint

@@ -11,10 +11,11 @@ import torch
 
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.data.schema import RobotTaskSpec, features
+from manip_il.data.schema import features
 from manip_il.learn.checkpoint import Origin
 from manip_il.learn.network import threads
 from manip_il.mdp import Episode
+from manip_il.worlds.contract import EnvironmentSpec
 
 N, K, EPISODES, LENGTH = 4, 6, 12, 20
 Table = dict[str, np.ndarray]
@@ -27,8 +28,8 @@ def _one_thread():
 
 
 @pytest.fixture(scope="session")
-def spec() -> RobotTaskSpec:
-    return RobotTaskSpec(
+def spec() -> EnvironmentSpec:
+    return EnvironmentSpec(
         robot="arm",
         task="reach",
         fps=25,
@@ -40,7 +41,7 @@ def spec() -> RobotTaskSpec:
 
 
 @pytest.fixture
-def pictured(spec) -> RobotTaskSpec:
+def pictured(spec) -> EnvironmentSpec:
     return replace(spec, cameras=("front", "wrist"), image_size=(32, 48), video=False)
 
 
@@ -74,7 +75,7 @@ def gapped(table) -> Table:
     return table
 
 
-def write_table(table: Mapping[str, np.ndarray], root: Path, spec: RobotTaskSpec) -> tuple[Dataset, ...]:
+def write_table(table: Mapping[str, np.ndarray], root: Path, spec: EnvironmentSpec) -> tuple[Dataset, ...]:
     """A dataset on disk, what the table lacks being zeros, pictures noise."""
     rng = np.random.default_rng(0)
     episodes = []

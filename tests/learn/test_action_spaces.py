@@ -14,7 +14,7 @@ from lerobot.policies.factory import make_policy, make_policy_config, make_pre_p
 
 from manip_il.data.dataset import Dataset
 from manip_il.data.joined import JoinedDatasets
-from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
+from manip_il.data.schema import ACTION, STATE
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import Checkpoint
@@ -27,7 +27,7 @@ from manip_il.robots import table as robots
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import LeRobotConfig
 from manip_il.robots.table import get_robot
-from manip_il.tasks.stock.table import TWO_ARMS
+from manip_il.worlds.contract import TWO_ARMS, EnvironmentSpec
 
 from ..tables import every_large_robot, every_robot
 from .conftest import write_table
@@ -55,8 +55,8 @@ def poses(robot: str, joints: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def panda() -> RobotTaskSpec:
-    return RobotTaskSpec("panda", "reach", 20, get_robot("panda").joint_names, ("e0", "e1"), 5, "reach")
+def panda() -> EnvironmentSpec:
+    return EnvironmentSpec("panda", "reach", 20, get_robot("panda").joint_names, ("e0", "e1"), 5, "reach")
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_joint_spaces_lose_nothing(robot, space):
 @pytest.mark.parametrize("settings", [{"width": 8}, ACT], ids=["mlp", "act"])
 def test_both_grippers_of_two_arms_are_absolute(settings, tmp_path):
     names = tuple(f"{side}_{number}" for side in ("left", "right") for number in range(7))
-    spec = RobotTaskSpec("aloha", "lift", 50, names, ("e0", "e1"), 5, "lift", action_meaning=TWO_ARMS)
+    spec = EnvironmentSpec("aloha", "lift", 50, names, ("e0", "e1"), 5, "lift", action_meaning=TWO_ARMS)
     rng = np.random.default_rng(0)
     states, actions = rng.normal(size=(2, EPISODES * LENGTH, 14)).astype(np.float32)
     episodes = np.repeat(np.arange(EPISODES), LENGTH)

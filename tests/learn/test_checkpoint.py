@@ -22,7 +22,7 @@ from manip_il.learn.lerobot_config import policy_class, policy_config, policy_ty
 from manip_il.learn.names import PLAIN
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import Trainer
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import make_config
 
 from .tiny_policies import ACT, CNN, edit_config, observations, refused, write_checkpoint
 

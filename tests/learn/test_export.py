@@ -20,7 +20,7 @@ from safetensors.torch import load_file, save_file
 from manip_il.cli.main import main
 from manip_il.data.dataset import Dataset
 from manip_il.data.fingerprint import policy_sha256
-from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, SERVOS, STATE, RobotTaskSpec
+from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError
 from manip_il.learn import export
 from manip_il.learn.checkpoint import Origin
@@ -29,6 +29,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import Trainer
+from manip_il.worlds.contract import SERVOS, EnvironmentSpec
 
 from .tiny_policies import write_checkpoint
 
@@ -38,7 +39,7 @@ Observation = dict[str, NDArray[Any]]
 
 
 @cache
-def sample() -> tuple[RobotTaskSpec, dict[str, NDArray[Any]]]:
+def sample() -> tuple[EnvironmentSpec, dict[str, NDArray[Any]]]:
     columns = [STATE, ENVIRONMENT_STATE, "action", "label_valid", "episode_index", "frame_index"]
     return Dataset.open(SAMPLE).spec, Dataset.open(SAMPLE).columns(columns)
 
@@ -50,14 +51,14 @@ def mlp(request, tmp_path) -> Path:
     return Trainer((Dataset.open(SAMPLE),), config, tmp_path / "run").fit()
 
 
-def write_cnn(folder: Path, spec: RobotTaskSpec, observation: str = "images", **options: Any) -> Path:
+def write_cnn(folder: Path, spec: EnvironmentSpec, observation: str = "images", **options: Any) -> Path:
     pictured = replace(spec, cameras=("wrist", "front"), image_size=SIDES)
     return write_checkpoint(
         folder, "cnn", pictured, observation, origin=Origin.of(pictured, observation=observation), **options
     )
 
 
-def drawn(spec: RobotTaskSpec, rows: int, pictures: bool = False) -> Observation:
+def drawn(spec: EnvironmentSpec, rows: int, pictures: bool = False) -> Observation:
     """Noise, and beside it in every second picture a small bright thing on black, which keypoints are sharp on."""
     rng = np.random.default_rng(1)
     observation = {

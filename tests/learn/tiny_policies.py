@@ -12,11 +12,12 @@ import torch
 from lerobot.configs import FeatureType
 from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
-from manip_il.data.schema import ENVIRONMENT_STATE, STATE, RobotTaskSpec, features
+from manip_il.data.schema import ENVIRONMENT_STATE, STATE, features
 from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.learn.lerobot_config import policy_features, policy_types
 from manip_il.learn.policy import LearnedPolicy
+from manip_il.worlds.contract import EnvironmentSpec
 
 ACT = {  # a policy that plans, by its options
     "type": "act",
@@ -51,7 +52,7 @@ TINY: dict[str, dict[str, Any]] = {
 def write_checkpoint(
     folder: Path,
     kind: str,
-    spec: RobotTaskSpec,
+    spec: EnvironmentSpec,
     observation: str = "state",
     *,
     origin: Origin | None = None,

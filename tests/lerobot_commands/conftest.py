@@ -19,7 +19,7 @@ from manip_il.evaluation.runner import episode_result
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 from ..warm import Warm
 

@@ -11,7 +11,7 @@ from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 from manip_il.errors import UnknownName, UsageError
 from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.lerobot_plugin.environment import TASKS
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import make_config
 
 from ..tables import BEYOND
 

@@ -11,7 +11,7 @@ import pytest
 
 from manip_il.data.schema import EXECUTED_ACTION
 from manip_il.sim.config import CameraConfig
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import make_config
 
 pytestmark = [pytest.mark.slow, pytest.mark.gl]
 SIDE, STEPS, COUNT = 32, 10, 4

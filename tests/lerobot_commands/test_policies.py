@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import make_config
 
 pytestmark = pytest.mark.slow
 UNFILMED = "--env.render_mode=none"  # these tests need no OpenGL

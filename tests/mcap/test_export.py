@@ -38,7 +38,7 @@ FEATURES: dict[str, dict[str, Any]] = {
 
 
 @pytest.fixture(scope="module")
-def ours(tmp_path_factory: pytest.TempPathFactory, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
+def ours(tmp_path_factory: pytest.TempPathFactory, episodes: list[Episode], spec: s.EnvironmentSpec) -> Path:
     root = tmp_path_factory.mktemp("ours") / "d"
     write_dataset(episodes, root, spec, fingerprint={})
     return root

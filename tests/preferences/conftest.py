@@ -28,7 +28,7 @@ def _one_thread():
 
 
 @pytest.fixture(scope="session")
-def datasets(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Path:
+def datasets(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, spec: s.EnvironmentSpec) -> Path:
     """A folder with the datasets `good`, whose episodes get to the end, `bad`, whose episodes do not, and `other`."""
     folder = tmp_path_factory.mktemp("supply")
     spec = replace(spec, robot="arm")  # none that is known here, whose columns would be compared
@@ -39,7 +39,7 @@ def datasets(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode
     return folder
 
 
-def write(root: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> None:
+def write(root: Path, episodes: list[Episode], spec: s.EnvironmentSpec) -> None:
     write_dataset(episodes, root, spec, fingerprint={})
 
 
@@ -61,7 +61,7 @@ def error(capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
     return line
 
 
-def brought(episode: Episode, spec: s.RobotTaskSpec, well: bool) -> Episode:
+def brought(episode: Episode, spec: s.EnvironmentSpec, well: bool) -> Episode:
     """The episode with its object on the way from 0 to 1, all of it or a third and back; progress is how far it is."""
     rng, steps = np.random.default_rng(episode.seed), len(episode)
     way = np.linspace(0, 1, steps) if well else 0.35 * np.sin(np.linspace(0, np.pi, steps))

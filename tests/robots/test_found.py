@@ -17,7 +17,7 @@ from manip_il.robots.robot import FOUND, Robot
 from manip_il.robots.rotations import angle_across, angle_off_vertical
 from manip_il.robots.table import get_robot, read_robot
 from manip_il.seeding import stream_seeds
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import make_config
 
 from ..scenes import started, still
 from .own import ARM, EXAMPLES, JAWS, model_of, tree_of, write

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from manip_il.collect.environments import env_fingerprint
 from manip_il.errors import UsageError
 from manip_il.robots import ROBOTS, reach
 from manip_il.robots.ik import ArmIK
@@ -18,8 +17,8 @@ from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_model, arm_spec
 from manip_il.robots.table import get_robot
 from manip_il.sim.scene import PREFIX
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import scene_of
+from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.table import env_fingerprint, make_config
 
 from ..scenes import drive, started, world_at_home
 from ..tables import every_robot

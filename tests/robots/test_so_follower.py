@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from manip_il.collect.environments import env_actions, env_spec
-from manip_il.data.schema import ACTION, LEROBOT_TYPES, SERVOS, STATE, features
+from manip_il.data.schema import ACTION, LEROBOT_TYPES, STATE, features
 from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.robots import ROBOTS
 from manip_il.robots.table import get_robot
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import scene_of
+from manip_il.worlds.contract import SERVOS
+from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.table import described_env, env_spec, make_config
 
 from ..scenes import started
 from ..so_follower import Camera, arm, recorders_features
@@ -64,7 +64,7 @@ def test_a_measured_state_is_what_the_real_arms_servos_read(real):
 
 
 def test_the_real_arm_goes_where_an_action_sends_the_simulated_one(real):
-    actions = env_actions(make_config("so101", "reach"))
+    actions = described_env(make_config("so101", "reach")).actions
     rng = np.random.default_rng(0)
     for _ in range(20):
         action = rng.uniform(actions.low, actions.high)

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from manip_il.collect.expert import Expert
+from manip_il import Expert
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.env import ManipEnv, environment_state_names
-from manip_il.tasks.envs import make_env
+from manip_il.worlds.ladder.envs import make_env
 
 from ..tables import every_robot, every_scene, every_scene_with_a_cube
 

@@ -8,9 +8,9 @@ import pytest
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
-from manip_il.tasks.envs import make_env
 from manip_il.tasks.sort import asked
 from manip_il.tasks.table import TASKS
+from manip_il.worlds.ladder.envs import make_env
 
 from ..scenes import has_goal, started
 from ..tables import every_scene, every_scene_with_cubes

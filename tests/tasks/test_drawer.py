@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from manip_il.collect.expert import Expert
+from manip_il import Expert
 from manip_il.sim.task import phases
 from manip_il.tasks.drawer import CABINET, OBJECT
 from manip_il.tasks.starts import UPRIGHT

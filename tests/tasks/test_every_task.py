@@ -13,10 +13,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from manip_il.collect import environments
+from manip_il import Expert
 from manip_il.collect.drivers import driver_of
-from manip_il.collect.environments import env_fingerprint, env_spec
-from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.data.schema import EXPERT_PHASE
 from manip_il.mdp import State
@@ -25,10 +23,11 @@ from manip_il.sim.events import STANDARD
 from manip_il.sim.task import NO_PHASE, phases
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks import NAMES
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS, get_task
+from manip_il.worlds.ladder import world
+from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..scenes import has_goal, sizes_of, started, still
 from ..tables import SCENES, WITH_A_CUBE, every_scene, every_task
@@ -183,8 +182,8 @@ def test_the_fingerprint_changes_with_the_model(change: str, monkeypatch):
     before = env_fingerprint(config)
     model = copy.copy(scene.model)
     CHANGES[change](model)
-    monkeypatch.setattr(environments, "config_scene", lambda _: replace(scene, model=model))
-    after = environments._fingerprint.__wrapped__(config)  # pyright: ignore[reportFunctionMemberAccess]
+    monkeypatch.setattr(world, "config_scene", lambda _: replace(scene, model=model))
+    after = world.WORLD.fingerprint(config)
     assert {key for key in before if before[key] != after[key]} == {"model_sha256"}
 
 

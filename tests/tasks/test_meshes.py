@@ -13,19 +13,18 @@ import trimesh
 import zstandard
 
 import manip_il
+from manip_il import Expert
 from manip_il.cli.main import main
 from manip_il.collect.edits import open_source
-from manip_il.collect.environments import env_fingerprint, env_spec, is_known
-from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UsageError
 from manip_il.sim.rests import LEAST_ROOM
 from manip_il.sim.shape import DENSITY, LIGHTEST, ObjectShape
 from manip_il.sim.world import World
-from manip_il.tasks.config import make_config, stored_config
-from manip_il.tasks.envs import make_env, scene_of
 from manip_il.tasks.grasp import lie_of
+from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config, stored_config, world_of
 from tests.meshes import MESHES, write_mesh
 
 OBJECT = "object"
@@ -124,7 +123,7 @@ def test_data_have_its_name_and_hash_and_no_path(folder, tmp_path):
     moved = tmp_path / "mug.obj"
     moved.write_bytes((folder / "mug.obj").read_bytes())
     assert env_fingerprint(make_config("panda", object=f"mesh:{moved}:0.06")) == before
-    assert not is_known("panda", "pick_place", spec.object)
+    assert world_of("panda").own_files("panda", "pick_place", spec.object)
     with pytest.raises(UsageError, match=r"name of the mesh was stored; give --task\.object=mesh:PATH/mug\.obj:0\.06"):
         stored_config(spec)
 

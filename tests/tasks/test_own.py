@@ -14,7 +14,6 @@ import zstandard
 import manip_il
 from manip_il.cli.main import main
 from manip_il.collect.edits import open_source
-from manip_il.collect.environments import env_fingerprint, env_spec, is_known
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UnknownName, UsageError
@@ -22,9 +21,9 @@ from manip_il.robots import ROBOTS
 from manip_il.robots import table as robots
 from manip_il.sim.points import point_names
 from manip_il.tasks import table
-from manip_il.tasks.config import make_config
-from manip_il.tasks.envs import scene_of
 from manip_il.tasks.table import get_task
+from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config, world_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "new-task.md"
 TOUCH, RAISE = (block.split("```", 1)[0] for block in PAGE.read_text().split("```python\n")[1:])
@@ -127,7 +126,7 @@ def test_data_and_results_name_a_task_and_run_nothing(touch, tmp_path, monkeypat
     words = ["--dataset.num_episodes=2", "--dataset.root=data", "--workers=1"]
     assert main(["record", f"--task.type={touch}", *words]) == 0
     assert main(["data", "check", "data"]) == 0
-    assert not is_known("panda", "touch")
+    assert world_of("panda").own_files("panda", "touch", "")
     with pytest.raises(ManipError, match="unknown task 'touch'"):
         open_source(tmp_path / "data")
     assert open_source(tmp_path / "data", task=touch).warnings == ()

@@ -46,7 +46,7 @@ from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.lerobot_layout import VERSION
 from manip_il.errors import ManipError, UsageError
 from manip_il.sim.conditions import NOMINAL
-from manip_il.tasks import ENV_IDS
+from manip_il.worlds.table import world_of
 
 _ADDRESS = re.compile(r"(datasets/|models/)?((?!datasets/|models/)\w[\w.-]*/\w[\w.-]*)(?:@(\w[\w./-]*))?")
 _HIDDEN = re.compile(r"(.*/)?\.[^./]")  # such as the Hub's own .gitattributes
@@ -253,7 +253,7 @@ def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, P
     template = Path(__file__).with_name("card.md.jinja").read_text(encoding="utf-8")
     with explained(f"write a card of {root}"):  # its JSON files may hold any values
         facts = {"dataset": Dataset.open(root)} if kind == "dataset" else policy_facts(root)
-        about = {"place": place, "version": version("manip_il"), "env_ids": ENV_IDS}
+        about = {"place": place, "version": version("manip_il")}
         text = environment.from_string(template).render(facts, **about)
     (folder / CARD).write_text(f"{text}\n", encoding="utf-8")
     return {CARD: folder / CARD}
@@ -273,6 +273,8 @@ def policy_facts(root: Path) -> dict[str, Any]:
     for name in ("config", "manip_il", "train_config"):
         path = root / inside / f"{name}.json"
         facts[name] = checks.read_json(path, "JSON") if path.is_file() else {}
+    robot, task = (facts["manip_il"].get(name) or "" for name in ("robot", "task"))
+    facts["lerobot_words"] = world_of(robot).lerobot_words(robot, task)
     own = policy_sha256(root / inside)
     evaluations = [  # of this policy, undisturbed, and not on the seeds that chose it
         result

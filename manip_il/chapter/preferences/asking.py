@@ -18,7 +18,7 @@ from manip_il.data import schema
 from manip_il.evaluation.film import encode_mp4
 from manip_il.mdp import F64
 from manip_il.sim.config import FILM, CameraConfig
-from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.worlds.table import env_spec
 
 SIDE = 240  # edge of a film [pixels]
 MOST_FPS = 10  # films play in real time; rendering a picture takes tens of milliseconds
@@ -72,6 +72,8 @@ def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
 
 
 def _film(source: EditSource, states: F64, fps: float) -> bytes:
-    camera = next(iter(STOCK[source.env.robot].cameras if source.env.robot in STOCK else ()), _CAMERA)
+    spec = env_spec(source.env)
+    spec.require("drawn", "choose another robot")
+    camera = spec.default_cameras[0]
     pictures = render_states(source.env, CameraConfig((camera,), SIDE, SIDE, FILM), states)
     return encode_mp4(list(pictures[schema.IMAGES + camera]), fps)

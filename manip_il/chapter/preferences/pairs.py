@@ -28,13 +28,13 @@ from manip_il.chapter.reward import LearnedReward
 from manip_il.data import schema
 from manip_il.data.build import dataset_sha256
 from manip_il.data.dataset import Dataset
-from manip_il.data.fingerprint import canonical_json
 from manip_il.data.lerobot_layout import EPISODE_INDEX
-from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.checkpoint import in_one_line
 from manip_il.learn.sources import check_same_sources
 from manip_il.mdp import F32, F64, I64, require_finite
+from manip_il.worlds.contract import EnvironmentSpec
+from manip_il.worlds.fingerprint import canonical_json
 
 Members = Callable[[F32], F64]  # maps inputs (B, d) to the rewards (M, B) of M networks
 POOL = 10  # candidates per pair when choosing by disagreement
@@ -57,7 +57,7 @@ class Frames:
     if the dataset has no such column.
     """
 
-    spec: RobotTaskSpec
+    spec: EnvironmentSpec
     inputs: F32
     episodes: I64
     progress: F64 | None = None

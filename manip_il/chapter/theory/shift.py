@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.collect.drivers import PolicyDriver
-from manip_il.collect.environments import env_actions, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
@@ -28,7 +27,8 @@ from manip_il.learn.policy import LearnedPolicy, actions_along
 from manip_il.mdp import F64, Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import described_env, env_spec
 
 EPISODES = 50  # episodes of the expert and of each round's policy
 WRONG = 0.25  # an action is wrong if any joint is off the label by more than this share of its largest step
@@ -121,7 +121,7 @@ def measure_shift(
 
     conditions: the run's variations of the world. u: the expert's recoverability on `env`, see `certify`.
     """
-    seeds, scale = stream_seeds("theory", episodes), env_actions(env).scale
+    seeds, scale = stream_seeds("theory", episodes), described_env(env).actions.scale
     spec, found = env_spec(env), list[RoundShift]()
     hand = [spec.environment_state_names.index(name) for name in _HAND]
     plain = RolloutJob(env, hold=0, conditions=conditions)

@@ -25,7 +25,7 @@ from manip_il.evaluation.runner import Trial
 from manip_il.evaluation.side import Side, read_side, require_pair, require_same_env, select_rounds
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.seeding import stream_seeds
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
 
 _YAML = (".yaml", ".yml")
 _OF_STUDY = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study sets

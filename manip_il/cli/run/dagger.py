@@ -12,7 +12,6 @@ from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.outputs import REPORT_FILE, write_page
 from manip_il.cli.progress import Stages, say, say_next
 from manip_il.cli.run.inputs import check_given, env_config, env_options, round_policy
-from manip_il.collect.environments import env_fingerprint
 from manip_il.collect.query import parse_query
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_json
@@ -23,7 +22,8 @@ from manip_il.evaluation.suites import varied
 from manip_il.evaluation.tables import CLONING, DAGGER
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
-from manip_il.tasks.config import EnvConfig
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import env_fingerprint
 
 
 def run_dagger(options: DaggerOptions) -> None:

@@ -16,7 +16,6 @@ from manip_il.data.atomic import exclusive
 from manip_il.data.build import build, merge_datasets
 from manip_il.data.ownership import DATASET
 from manip_il.evaluation.suites import varied
-from manip_il.tasks.stock.envs import check_cameras
 
 _RUN = "dataset"  # folder of a DAgger run with the states of all rounds
 
@@ -77,7 +76,6 @@ def run_redraw(options: RedrawOptions) -> None:
     with _open(options, "redrawn", root, -(-options.frames // CHUNK)) as (source, target):
         conditions = varied(options.vary, source.env, sees=True)
         cameras = options.camera_config(source.env)
-        check_cameras(source.env.robot, cameras)  # also if only states are written
         cameras = cameras if options.pictures else None
         scenes = Scenes(cameras, options.frames, options.seed, options.scenes, conditions, options.branch_steps)
         info = redraw_dataset(source, scenes, target)

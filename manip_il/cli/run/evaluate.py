@@ -11,7 +11,6 @@ from manip_il.cli.evaluate import EvalOptions
 from manip_il.cli.outputs import OutputFile, publish
 from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.cli.run.inputs import open_driver, path_options
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import default_workers
 from manip_il.data.atomic import write_file
@@ -27,7 +26,8 @@ from manip_il.evaluation.suites import suite_conditions
 from manip_il.seeding import stream_seeds
 from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, CameraConfig
-from manip_il.tasks.envs import make_env
+from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.table import env_fingerprint, env_spec
 
 NO_FILES = ("expert", "random")  # drivers without a checkpoint
 

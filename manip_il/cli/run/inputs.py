@@ -13,7 +13,6 @@ from manip_il.cli.common_options import OF_POLICY
 from manip_il.cli.options import Given, Open
 from manip_il.cli.progress import warn
 from manip_il.collect.drivers import Driver, PolicyDriver, driver_of
-from manip_il.collect.environments import env_fingerprint, env_spec, is_known
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import SIM_STATE, check_same_spec, features
@@ -21,12 +20,9 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.sources import check_same_sources
-from manip_il.robots.table import is_robot
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.shape import MESH
-from manip_il.tasks.config import EnvConfig, complete, stored_config
-from manip_il.tasks.stock import table as stock
-from manip_il.tasks.table import is_task
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import complete, env_fingerprint, env_spec, stored_config, world_of
 
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 
@@ -53,13 +49,9 @@ def env_config(env: Given, origin: Origin | None = None) -> EnvConfig:
 def own_files(robot: str, task: str, shape: str = "") -> list[str]:
     """Return the options, with FILE for a path, that commands need for what a dataset or a policy only names.
 
-    robot, task, shape: as in a `RobotTaskSpec`.
+    robot, task, shape: as in a `EnvironmentSpec`.
     """
-    if robot in stock.ROBOTS or task == UNKNOWN_TASK:
-        return []
-    robots = [] if is_robot(robot) else ["--robot.type=FILE.yaml"]
-    meshes = ["--task.object=mesh:FILE:LENGTH"] if shape.startswith(MESH) else []
-    return [*robots, *([] if is_task(task) else ["--task.type=FILE.py"]), *meshes]
+    return [] if task == UNKNOWN_TASK else world_of(robot).own_files(robot, task, shape)
 
 
 def env_options(env: EnvConfig) -> list[str]:
@@ -140,7 +132,7 @@ def differences(dataset: Dataset) -> list[str]:
     because it holds only the name of that arm or task.
     """
     spec, name = dataset.spec, str(dataset.root)
-    if not is_known(spec.robot, spec.task, spec.object):
+    if world_of(spec.robot).own_files(spec.robot, spec.task, spec.object):
         return []
     env = stored_config(spec)
     check_same_spec(name, spec, "this program", env_spec(env))

@@ -13,13 +13,12 @@ from manip_il.cli.outputs import REPORT_FILE, write_page
 from manip_il.cli.progress import Stages, say
 from manip_il.cli.run.dagger import say_best
 from manip_il.cli.run.inputs import open_datasets
-from manip_il.collect.environments import env_spec
 from manip_il.data.json_lines import read_lines
-from manip_il.data.schema import RobotTaskSpec
 from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.rounds import METRICS_FILE
 from manip_il.learn.checkpoint import Origin
-from manip_il.tasks.config import stored_config
+from manip_il.worlds.contract import EnvironmentSpec
+from manip_il.worlds.table import env_spec, stored_config
 
 
 def _run(options: Learning, config: LearningConfig) -> None:
@@ -39,7 +38,7 @@ def _run(options: Learning, config: LearningConfig) -> None:
     say_best(folder, config.env)
 
 
-def _config(options: Learning, spec: RobotTaskSpec | Origin, **more: Any) -> LearningConfig:
+def _config(options: Learning, spec: EnvironmentSpec | Origin, **more: Any) -> LearningConfig:
     """Return the configuration for the environment of `spec`; `UnknownName` if that is not built in."""
     env = stored_config(spec)
     start = None if options.init is None else find_policy(options.init)

@@ -10,7 +10,6 @@ from manip_il.cli.outputs import check_same_options, prepare_output, require_wri
 from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.cli.record import RecordOptions
 from manip_il.cli.run.inputs import env_config
-from manip_il.collect.environments import env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance
 from manip_il.data.atomic import exclusive
@@ -23,6 +22,7 @@ from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.runner import HOLD
 from manip_il.evaluation.suites import varied
 from manip_il.seeding import stream_seeds
+from manip_il.worlds.table import env_spec
 
 
 def run_record(options: RecordOptions) -> None:

@@ -5,25 +5,22 @@ from __future__ import annotations
 import contextlib
 import socket
 from dataclasses import replace
+from typing import Any
 
 from manip_il.cli.common_options import default_cameras
 from manip_il.cli.progress import say
 from manip_il.cli.run.inputs import open_driver
 from manip_il.cli.view import IN_A_FILE, ViewOptions
-from manip_il.collect.environments import make_env
 from manip_il.collect.job import RolloutJob, observed_cameras, run_steps
-from manip_il.collect.rollout import Environment
 from manip_il.errors import UsageError
 from manip_il.evaluation.runner import HOLD
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.evaluation.watch import RerunLog, WindowScreen, outcome
-from manip_il.mdp import LONGEST_EPISODE
 from manip_il.seeding import BLOCK, stream_seeds
-from manip_il.sim.config import FILM, CameraConfig, Look
-from manip_il.sim.env import ManipEnv
+from manip_il.sim.config import FILM, LONGEST_EPISODE, CameraConfig, Look
 from manip_il.sim.window import has_display
-from manip_il.tasks.config import EnvConfig
-from manip_il.tasks.stock.table import ROBOTS as STOCK
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import env_spec, make_env
 
 SIZE = {"height": 240, "width": 320}  # picture size for people [pixels]
 
@@ -34,11 +31,11 @@ def run_view(options: ViewOptions) -> None:
     env, driver, cameras = open_driver(
         options.policy.path, options.policy.type or "expert", options.env, trust=options.trust
     )
-    in_window = in_window and env.robot not in STOCK
     if sliders and not in_window:
-        raise UsageError(
-            "--policy.type=sliders opens a window: set DISPLAY and omit --output; not for fetch_stock and aloha"
-        )
+        raise UsageError("--policy.type=sliders opens a window: set DISPLAY and omit --output")
+    if sliders:
+        env_spec(env).require("shown in a window", "choose another --policy.type than sliders")
+    in_window = in_window and "shown in a window" in env_spec(env).can
     if cameras is None and not in_window:  # for people to watch; shadows only in files, which may take longer
         cameras = CameraConfig(default_cameras(env), **SIZE, look=FILM if options.output else Look())
     if sliders and not options.env.get("horizon"):
@@ -57,8 +54,8 @@ def run_view(options: ViewOptions) -> None:
         say(f"next: rerun {options.output}")
 
 
-def _screen(options: ViewOptions, env: Environment, config: EnvConfig, in_window: bool) -> WindowScreen | RerunLog:
-    if in_window and isinstance(env, ManipEnv):
+def _screen(options: ViewOptions, env: Any, config: EnvConfig, in_window: bool) -> WindowScreen | RerunLog:
+    if in_window:
         return WindowScreen(env, sliders=options.policy.type == "sliders")
     log = RerunLog(config, options.output)
     if log.address:

@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.checks import task_name
-from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.errors import ManipError, UsageError
 from manip_il.tasks.carry.layout import FEATURES, Reward
-from manip_il.tasks.config import make_config
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 numbers = st.floats(0, 1e6, allow_subnormal=False)
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from manip_il.collect.expert import Expert
+from manip_il import Expert
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names
 from manip_il.sim.task import phases
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.carry.layout import OBSTACLES, TASTES
 from manip_il.tasks.carry.obstacles import EDGE, TASTE_BODIES, is_there, layout_of, observed_layout, reward_in
 from manip_il.tasks.carry.task import OBJECT, descent_of
-from manip_il.tasks.envs import make_env
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
+from manip_il.worlds.ladder.envs import make_env
 
 from ...scenes import SEED, drive_until, started
 from ...tables import every_robot

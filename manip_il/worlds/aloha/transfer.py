@@ -7,14 +7,16 @@ from functools import cached_property
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.tasks.stock.aloha.ladder import (
+from manip_il.worlds.aloha.ladder import (
     CLOSED,
     FAST,
     LIFTED,
     OPEN,
     PITCH,
     AlohaScene,
+    AlohaTask,
     HandTarget,
+    Held,
     X,
     Z,
     ahead_across,
@@ -24,7 +26,7 @@ from manip_il.tasks.stock.aloha.ladder import (
     pitched,
     take_rungs,
 )
-from manip_il.tasks.stock.base import StockRung, always
+from manip_il.worlds.packaged import PackagedRung, always
 
 CUBE = "box"
 MEETING = np.array([0.0, 0.5, 0.25])  # position of the cube for the handover [m]
@@ -108,22 +110,31 @@ def _wait(scene: Transfer) -> HandTarget:
     return HandTarget(MEETING + WAITING, ahead_across(X, Z), OPEN, FAST)
 
 
-RUNGS = {
+_RUNGS = {
     "left": (
-        StockRung(
+        PackagedRung(
             "hold", lambda one: one.left_holds, lambda one: HandTarget(one.left.position, one.left.rotation, CLOSED)
         ),
-        StockRung(
+        PackagedRung(
             "close",
             lambda one: one.lifted and one.is_at_grasp("left", CUBE, one.left_grasp),
             lambda one: close_on(one, CUBE, one.left_grasp, CARRIED),
         ),
-        StockRung("come", lambda one: one.right_holds and one.lifted and one.to_go < NEAR, _come),
-        StockRung("wait", always, _wait),
+        PackagedRung("come", lambda one: one.right_holds and one.lifted and one.to_go < NEAR, _come),
+        PackagedRung("wait", always, _wait),
     ),
     "right": (
-        StockRung("release", lambda one: one.left_holds and one.left.gap < LEFT_CLOSED, _let_go),
-        StockRung("carry", lambda one: one.right_holds, _carry),
+        PackagedRung("release", lambda one: one.left_holds and one.left.gap < LEFT_CLOSED, _let_go),
+        PackagedRung("carry", lambda one: one.right_holds, _carry),
         *take_rungs("right", CUBE, lambda one: one.right_grasp),
     ),
 }
+TASK = AlohaTask(
+    "AlohaTransferCube-v0",
+    "Pick up the cube with the right arm and transfer it to the left arm.",
+    "transfer_cube",
+    {CUBE: Held(0.027, 0.017)},
+    {CUBE: "right"},
+    Transfer,
+    _RUNGS,
+)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from importlib import import_module
+from typing import override
 
 import mujoco
 import numpy as np
@@ -11,11 +12,10 @@ import numpy as np
 from manip_il.mdp import F64, Label, State
 from manip_il.robots.ik import PoseProgram
 from manip_il.robots.rotations import turned_towards
-from manip_il.tasks.stock.aloha import insertion, transfer
-from manip_il.tasks.stock.aloha.environment import AlohaEnv
-from manip_il.tasks.stock.aloha.ladder import AlohaScene, Hand, HandTarget
-from manip_il.tasks.stock.base import StockRung
-from manip_il.tasks.stock.table import SIDES
+from manip_il.worlds.aloha.environment import AlohaEnv
+from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, Hand, HandTarget
+from manip_il.worlds.contract import Environment, Expert
+from manip_il.worlds.packaged import Packaged
 
 ORIENTATION, POSTURE = 0.3, 0.003  # costs [1/rad], relative to 1 [1/m] for the position
 ROLL, STRAIGHT = 0.15, (0.15, 0.35)  # forearm roll's cost at a straight wrist; peak's width, wrist up and down [rad]
@@ -27,29 +27,22 @@ CREEPS = 0.95  # share of the breakaway lead below which a joint creeps
 BREAKAWAY = 1.5  # step of a joint per lead beyond it
 
 
-LADDERS: dict[str, tuple[type[AlohaScene], dict[str, tuple[StockRung, ...]]]] = {
-    "AlohaTransferCube-v0": (transfer.Transfer, transfer.RUNGS),
-    "AlohaInsertion-v0": (insertion.Insertion, insertion.RUNGS),
-}
-
-
-class AlohaExpert:
-    """Labels any state of one task. The same state gives bit-equal labels in any order and process."""
+class AlohaExpert(Expert):
+    """Labels any state of one task."""
 
     def __init__(self, task: str):
         self._env = AlohaEnv(task)
-        self._kind, self._rungs = LADDERS[task]
         self._pairs = {pair: number for number, pair in enumerate(self._env.task.phases)}
         self._arms = {side: _Arm(self._env, number, side) for number, side in enumerate(SIDES)}
 
-    def label(self, state: State, world: object | None = None) -> Label:
-        """Return the expert's label of `state`, action (14,). Raises `MismatchError` for another task's state."""
+    @override
+    def label(self, state: State, environment: Environment | None = None) -> Label:
         env = self._env
         env.set_state(state)
-        scene = env.scene(self._kind)
+        scene = env.scene()
         if reason := self._unsound(scene):
             return self._still(reason)
-        rungs = {side: next(rung for rung in self._rungs[side] if rung.holds(scene)) for side in SIDES}
+        rungs = {side: next(rung for rung in env.task.rungs[side] if rung.holds(scene)) for side in SIDES}
         action = np.empty(len(env.actions))
         for number, (side, rung) in enumerate(rungs.items()):
             target = rung.target(scene)
@@ -135,3 +128,12 @@ def _alone(side: str) -> mujoco.MjModel:
     for geom in list(spec.geoms):
         spec.delete(geom)
     return spec.compile()
+
+
+class _Aloha(Packaged):
+    @override
+    def lerobot_words(self, robot: str, task: str) -> list[str]:
+        return ["--env.type=aloha", f"--env.task={task}", "--eval.batch_size=1"]
+
+
+WORLD = _Aloha(AlohaEnv, AlohaExpert)

@@ -1,4 +1,4 @@
-"""Experts of the stock environments: ladders over gripper, cube and goal, the task's last rung first.
+"""Experts of Fetch: ladders over gripper, cube and goal, the task's last rung first.
 
 A rung reads the environment. Its target is the gripper's displacement, (3,) [m], and the fingers' command, -1 to 1. An
 action of 1 moves the gripper by about `REACH` in a control step along each axis independently, so that the longest of
@@ -8,13 +8,14 @@ x, y and z determines how long a move takes.
 from __future__ import annotations
 
 import itertools
+from typing import override
 
 import numpy as np
 
 from manip_il.mdp import F64, Label, State
-from manip_il.tasks.stock.base import StockRung, always
-from manip_il.tasks.stock.environment import StockEnv
-from manip_il.tasks.stock.table import PHASES
+from manip_il.worlds.contract import Environment, Expert
+from manip_il.worlds.fetch.environment import FetchEnv
+from manip_il.worlds.packaged import Packaged, PackagedRung, always
 
 REACH = 0.032  # displacement of the gripper in one control step at an action of 1 [m]
 OPEN, CLOSE = 1.0, -1.0
@@ -49,27 +50,27 @@ DOWN = 0.5  # share of a step after which a gripper that descends past the cube 
 LEG = 0.005  # cost of every leg of a path around the cube, added to its length [m]
 
 
-def _to_cube(env: StockEnv) -> F64:
+def _to_cube(env: FetchEnv) -> F64:
     """Vector from gripper to cube, (3,) [m]."""
     return env.object - env.gripper
 
 
-def _to_grasp(env: StockEnv) -> F64:
+def _to_grasp(env: FetchEnv) -> F64:
     """Vector from gripper to where it grasps the cube, (3,) [m]."""
     return _to_cube(env) + [0, 0, GRASP_HEIGHT]
 
 
-def _holds(env: StockEnv) -> bool:
+def _holds(env: FetchEnv) -> bool:
     return bool((np.abs(_to_grasp(env)) < GRASPED).all() and env.opening < HELD)
 
 
-def _between(env: StockEnv) -> bool:
+def _between(env: FetchEnv) -> bool:
     """Whether the cube is between the fingers, or will be before they have closed."""
     wide = env.opening > 2 * HALF + OPENING * max(0.0, abs(_to_grasp(env)[0]) - 0.02)
     return wide and bool((np.abs(_to_grasp(env)) < NEAR).all())
 
 
-def _grasp(env: StockEnv) -> tuple[F64, float]:
+def _grasp(env: FetchEnv) -> tuple[F64, float]:
     """Go to the cube; close to it, lead towards the goal, so that a finger takes the cube along."""
     way = _to_grasp(env)
     share = max(0.0, 1 - np.abs(way).max() / CLOSED_ON)
@@ -77,7 +78,7 @@ def _grasp(env: StockEnv) -> tuple[F64, float]:
     return way, CLOSE
 
 
-def _over(env: StockEnv) -> tuple[F64, float]:
+def _over(env: FetchEnv) -> tuple[F64, float]:
     """Go to the cube, but not below its top before the fingers are on both sides of it."""
     way = _to_grasp(env)
     if abs(way[1]) > STRADDLE or env.opening < 2 * HALF + 0.01:
@@ -85,14 +86,14 @@ def _over(env: StockEnv) -> tuple[F64, float]:
     return way, OPEN
 
 
-def _rests_at_goal(env: StockEnv) -> bool:
+def _rests_at_goal(env: FetchEnv) -> bool:
     """Whether the cube is at the goal, or will slide there by itself."""
     velocity = env.object_velocity[:2]
     left = (env.goal - env.object)[:2] - velocity * np.hypot(*velocity) / (2 * DECELERATION)
     return bool(np.hypot(*left) < AT_GOAL)
 
 
-def _direction(env: StockEnv) -> F64:
+def _direction(env: FetchEnv) -> F64:
     """Direction in which to move the cube, a unit vector in the plane, (2,)."""
     way = (env.goal - env.object)[:2] - LOOK * env.object_velocity[:2]
     return way / max(float(np.hypot(*way)), 1e-6)
@@ -103,13 +104,13 @@ def _touching(direction: F64) -> float:
     return float(min(BOX / np.maximum(np.abs(direction), 1e-6)))
 
 
-def _is_behind(env: StockEnv) -> bool:
+def _is_behind(env: FetchEnv) -> bool:
     direction, way = _direction(env), _to_cube(env)[:2]
     along, off = way @ direction, abs(way[0] * direction[1] - way[1] * direction[0])
     return bool(0 < along < _touching(direction) + ALONG and off < ACROSS and -_to_cube(env)[2] < BELOW)
 
 
-def _push(env: StockEnv) -> tuple[F64, float]:
+def _push(env: FetchEnv) -> tuple[F64, float]:
     """Move at full speed in the direction to push, and towards the line through cube and goal."""
     direction = _direction(env)
     across = np.array([-direction[1], direction[0]])
@@ -117,19 +118,19 @@ def _push(env: StockEnv) -> tuple[F64, float]:
     return np.append(way, _to_cube(env)[2] + LOW), CLOSE
 
 
-def _ends(env: StockEnv) -> tuple[F64, F64]:
+def _ends(env: FetchEnv) -> tuple[F64, F64]:
     """Positions of the gripper now and behind the cube, both relative to the cube, (2,) [m]."""
     direction = _direction(env)
     return -_to_cube(env)[:2], -direction * (_touching(direction) + AHEAD)
 
 
-def _around(env: StockEnv) -> tuple[F64, float]:
+def _around(env: FetchEnv) -> tuple[F64, float]:
     """Go behind the cube, past its corners, as far as one step goes."""
     start, end = _ends(env)
     return np.append(_walk(start, _path(start, end)), _to_cube(env)[2] + LOW), CLOSE
 
 
-def _is_better_over(env: StockEnv) -> bool:
+def _is_better_over(env: FetchEnv) -> bool:
     """Whether the cube is in the way, and the path around it is long or the gripper is high already."""
     start, end = _ends(env)
     height = -_to_cube(env)[2]
@@ -139,7 +140,7 @@ def _is_better_over(env: StockEnv) -> bool:
     return height >= HIGH - 0.015 or around - np.abs(end - start).max() >= DETOUR
 
 
-def _over_cube(env: StockEnv) -> tuple[F64, float]:
+def _over_cube(env: FetchEnv) -> tuple[F64, float]:
     """Go straight over the cube to behind it: rise before crossing it, and descend as soon as it is past."""
     start, end = _ends(env)
     way = _walk(start, [end])
@@ -193,32 +194,36 @@ def _is_free(start: F64, end: F64) -> bool:
     return bool(enters >= leaves or leaves <= 0 or enters >= 1)
 
 
-LADDERS: dict[str, tuple[StockRung, ...]] = {
-    "FetchReach-v4": (StockRung("approach", always, lambda env: (env.goal - env.gripper, CLOSE)),),
+LADDERS: dict[str, tuple[PackagedRung, ...]] = {
+    "FetchReach-v4": (PackagedRung("approach", always, lambda env: (env.goal - env.gripper, CLOSE)),),
     "FetchPush-v4": (
-        StockRung("hold", _rests_at_goal, lambda env: (np.zeros(3), CLOSE)),
-        StockRung("push", _is_behind, _push),
-        StockRung("approach", _is_better_over, _over_cube),
-        StockRung("approach", always, _around),
+        PackagedRung("hold", _rests_at_goal, lambda env: (np.zeros(3), CLOSE)),
+        PackagedRung("push", _is_behind, _push),
+        PackagedRung("approach", _is_better_over, _over_cube),
+        PackagedRung("approach", always, _around),
     ),
     "FetchPickAndPlace-v4": (
-        StockRung("carry", _holds, lambda env: (env.goal - env.object, CLOSE)),
-        StockRung("grasp", _between, _grasp),
-        StockRung("approach", always, _over),
+        PackagedRung("carry", _holds, lambda env: (env.goal - env.object, CLOSE)),
+        PackagedRung("grasp", _between, _grasp),
+        PackagedRung("approach", always, _over),
     ),
 }
 
 
-class StockExpert:
-    """Labels any state of one stock task. The same state gives bit-equal labels in any order and process."""
+class FetchExpert(Expert):
+    """Labels any state of one of Fetch's tasks."""
 
     def __init__(self, task: str):
-        self._env = StockEnv(task)
+        self._env = FetchEnv(task)
         self._ladder = LADDERS[task]
 
-    def label(self, state: State, world: object | None = None) -> Label:
-        """Return the expert's action in `state`, (4,). Raises `MismatchError` for another task's state."""
+    @override
+    def label(self, state: State, environment: Environment | None = None) -> Label:
         self._env.set_state(state)
         rung = next(rung for rung in self._ladder if rung.holds(self._env))
         way, fingers = rung.target(self._env)
-        return Label(np.append(np.clip(way / REACH, -1, 1), fingers), PHASES.index(rung.name), True, 0.0)
+        phase = self._env.task.phases.index(rung.name)
+        return Label(np.append(np.clip(way / REACH, -1, 1), fingers), phase, True, 0.0)
+
+
+WORLD = Packaged(FetchEnv, FetchExpert)

@@ -9,11 +9,13 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_between
-from manip_il.tasks.stock.aloha.ladder import (
+from manip_il.worlds.aloha.ladder import (
     ARM,
     PITCH,
     AlohaScene,
+    AlohaTask,
     HandTarget,
+    Held,
     Thing,
     Z,
     cross,
@@ -21,7 +23,7 @@ from manip_il.tasks.stock.aloha.ladder import (
     pitched,
     take_rungs,
 )
-from manip_il.tasks.stock.base import StockRung
+from manip_il.worlds.packaged import PackagedRung
 
 PEG, SOCKET = "peg", "socket"
 OF = {"left": SOCKET, "right": PEG}
@@ -80,12 +82,12 @@ def _lifted_to(thing: Thing, to: F64) -> F64:
     return np.array([thing.position[0] + way[0], thing.position[1] + way[1], to[2]])
 
 
-def _carry(side: str, to: F64) -> StockRung:
+def _carry(side: str, to: F64) -> PackagedRung:
     def target(scene: Insertion) -> HandTarget:
         place = _lifted_to(scene.things[OF[side]], to)
         return move_object(scene, side, OF[side], place, np.eye(3), CARRIED)
 
-    return StockRung("carry", lambda scene: scene.has[side], target)
+    return PackagedRung("carry", lambda scene: scene.has[side], target)
 
 
 def _insert(scene: Insertion) -> HandTarget:
@@ -94,12 +96,22 @@ def _insert(scene: Insertion) -> HandTarget:
     return move_object(scene, "right", PEG, socket.position + scene.depth * frame[:, 0], frame, INSERTED)
 
 
-RUNGS = {
+_RUNGS = {
     "left": (_carry("left", MEETING), *take_rungs("left", SOCKET, lambda one: one.grasps["left"])),
     "right": (
-        StockRung("insert", lambda one: one.has["right"] and one.ready and one.depth < BEFORE, _insert),
-        StockRung("align", lambda one: one.has["right"] and one.ready, _insert),
+        PackagedRung("insert", lambda one: one.has["right"] and one.ready and one.depth < BEFORE, _insert),
+        PackagedRung("align", lambda one: one.has["right"] and one.ready, _insert),
         _carry("right", MEETING + WAITING),
         *take_rungs("right", PEG, lambda one: one.grasps["right"]),
     ),
 }
+TASK = AlohaTask(
+    "AlohaInsertion-v0",
+    "Insert the peg into the socket.",
+    "insertion",
+    {PEG: Held(0.018, 0.0075, long=True), SOCKET: Held(0.026, 0.019, long=True)},
+    {PEG: "right", SOCKET: "left"},
+    Insertion,
+    _RUNGS,
+    (PEG, SOCKET),
+)

@@ -1,4 +1,4 @@
-"""One environment of `gym_aloha`, unmodified, under this program's interface."""
+"""One environment of `gym_aloha`, unmodified, behind the contract of a world."""
 
 from __future__ import annotations
 
@@ -11,19 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.caching import cached_per_thread
-from manip_il.errors import ManipError, MismatchError, RenderError
+from manip_il.errors import ManipError, RenderError
 from manip_il.mdp import F64, Observation, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import REMEDY
 from manip_il.sim.view import simplify_meshes
-from manip_il.tasks.stock.aloha.ladder import AlohaScene, read_hand
-from manip_il.tasks.stock.base import WHOLE, StockBase
-from manip_il.tasks.stock.table import ALOHA, ALOHA_NAMES, ALOHA_TASKS
+from manip_il.worlds.aloha import insertion, transfer
+from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, read_hand
+from manip_il.worlds.contract import GRIPPERS as GRIPPERS_OF
+from manip_il.worlds.contract import TWO_ARMS
+from manip_il.worlds.packaged import WHOLE, PackagedEnv, coordinates
 
+ALOHA_TASKS = {one.TASK.name: one.TASK for one in (transfer, insertion)}
+_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
+ALOHA_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)  # as in `lerobot/aloha_sim_*`
 INSTALL = "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10 lxml==6.1.3"
 MOST_REWARD = 4
-GRIPPERS = np.array([6, 13])
+GRIPPERS = np.array(GRIPPERS_OF[TWO_ARMS])
 LONGEST = 0.04  # longest step of a joint, as for the expert [rad]
 _DEEP = 4e-3  # tolerated overlap in a redrawn scene [m]
 _ANEW = 0.6  # chance that an untouched object gets a new place; otherwise a hand reaching for it stays near it
@@ -44,15 +49,19 @@ class AlohaActions(ActionSpace):
         return action
 
 
-class AlohaEnv(StockBase):
+class AlohaEnv(PackagedEnv):
     """An environment of `gym_aloha`. task: a key of `ALOHA_TASKS`. cameras: rendered in every step.
 
     Raises `ManipError` if the package is not installed.
     """
 
+    robot, action_meaning = "aloha", TWO_ARMS
+    control_hz, horizon = 50, 400  # as in LeRobot's environment; the one registered with gymnasium has 300 steps
+    can = ("restored", "redrawn", "drawn")
+    ends_solved = True
+
     def __init__(self, task: str, cameras: CameraConfig | None = None):
         self.task, self._cameras = ALOHA_TASKS[task], cameras
-        self.task_description = self.task.instruction
         self._env = _gym_aloha().AlohaEnv(self.task.own, obs_type="pixels_agent_pos")
         self.physics = self._env._env.physics
         self.draw = self.physics.render
@@ -63,47 +72,49 @@ class AlohaEnv(StockBase):
 
     @override
     def start(self, seed: int) -> None:
-        """Begin the episode of a seed."""
         super().start(seed % 2**32)  # gym_aloha takes no larger seed
 
     @property
+    @override
     def progress(self) -> float:
         """Reward of the state as a share of the environment's highest reward."""
         return float(self._env._env.task.get_reward(self.physics)) / MOST_REWARD
 
-    def scene(self, kind: type[AlohaScene] = AlohaScene) -> AlohaScene:
+    def scene(self) -> AlohaScene:
         """Return the scene read from the state."""
-        return kind(self.task, self.model, self.data)
+        return self.task.scene(self.task, self.model, self.data)
 
     def measured(self) -> F64:
         """Return joint positions [rad] and gripper openings, 0 to 1, (14,)."""
         return self._env._env.task.get_qpos(self.physics)
 
+    @override
+    def observed_names(self) -> tuple[str, ...]:
+        found = self.scene().observed().items()
+        return tuple(one for name, value in found for one in (coordinates(name) if np.ndim(value) else (name,)))
+
+    @override
     def observe(self) -> Observation:
         """Return joint positions and gripper openings, (14,), the scene's `environment_state`, (k,), and pictures."""
-        state, environment = self.measured().astype(np.float32), self.scene().observed().astype(np.float32)
-        return Observation(state, environment, self._pictures() if self._cameras else {})
+        numbers = np.hstack([*self.scene().observed().values()])
+        pictures = self._pictures(self._cameras) if self._cameras else {}
+        return Observation(self.measured().astype(np.float32), numbers.astype(np.float32), pictures)
 
-    def get_state(self) -> State:
-        """Return everything that the future depends on; `set_state` restores it bit for bit."""
-        return State(self._physics(), np.empty(0), self._step, self._streak, self._ever)
-
+    @override
     def set_state(self, state: State) -> None:
-        """Restore a state of the same task. Raises `MismatchError` for a state of another task."""
-        if len(state.physics) != (expected := mujoco.mj_stateSize(self.model, WHOLE)):
-            raise MismatchError("size of the state", "the state", len(state.physics), self.task.name, expected)
+        self._restore(state, mujoco.mj_stateSize(self.model, WHOLE))
         mujoco.mj_setState(self.model, self.data, state.physics, WHOLE)
         mujoco.mj_forward(self.model, self.data)
-        self._begin(state)
 
-    @property
+    @override
     def positions(self) -> dict[str, F64]:
-        """Positions (3,) [m] of the right hand and the objects; the first object is called `object`."""
+        """Return the positions (3,) [m] of the right hand and the objects, the first of which is `object`."""
         scene = self.scene()
         names = ["object", *list(scene.things)[1:]]
         things = zip(names, scene.things.values(), strict=True)
         return {"hand": scene.right.position} | {name: thing.position for name, thing in things}
 
+    @override
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
         """Return `state` with some arms and some untouched objects on the table moved at random.
 
@@ -149,22 +160,21 @@ class AlohaEnv(StockBase):
             action = self.measured()
             action[GRIPPERS[number]] = 1.0
             for _ in range(rng.integers(1, _FALL)):
-                self.advance(action)
+                self.step(action)
 
     def _free(self, name: str) -> tuple[int, int]:
         """Addresses of an object's pose in `qpos` and of its velocity in `qvel`."""
         joint = self.model.body(name).jntadr[0]
         return int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
 
-    def _pictures(self) -> dict[str, NDArray[np.uint8]]:
-        assert self._cameras is not None
-        height, width = self._cameras.size
+    def _pictures(self, cameras: CameraConfig) -> dict[str, NDArray[np.uint8]]:
+        height, width = cameras.size
         painter = _painter(self.task.name, fine=height > _COARSE)
         painter.set_state(self.get_state())
         try:
-            return {name: painter.draw(height=height, width=width, camera_id=name) for name in self._cameras.names}
+            return {name: painter.draw(height=height, width=width, camera_id=name) for name in cameras.names}
         except Exception as error:  # what OpenGL and its bindings raise
-            raise RenderError(f"{ALOHA} cannot be rendered ({error}); {REMEDY}") from error
+            raise RenderError(f"{self.robot} cannot be rendered ({error}); {REMEDY}") from error
 
 
 @cached_per_thread()
@@ -184,7 +194,7 @@ def _gym_aloha() -> Any:
     try:
         return import_module("gym_aloha.env")
     except ModuleNotFoundError as error:
-        raise ManipError(f"{ALOHA} needs {error.name}, which is not installed: {INSTALL}") from error
+        raise ManipError(f"{AlohaEnv.robot} needs {error.name}, which is not installed: {INSTALL}") from error
 
 
 def _actions(model: mujoco.MjModel) -> ActionSpace:

@@ -1,25 +1,47 @@
-"""One Fetch environment of gymnasium-robotics, unmodified, under this program's interface."""
+"""One Fetch environment of gymnasium-robotics, unmodified, behind the contract of a world."""
 
 from __future__ import annotations
 
 import contextlib
 import io
+from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any
+from typing import Any, ClassVar, override
 
 import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import MismatchError
 from manip_il.mdp import F64, Observation, State
 from manip_il.robots.action_space import ActionSpace
-from manip_il.tasks.stock.base import WHOLE, StockBase
-from manip_il.tasks.stock.table import STATE_NAMES, STOCK, TOLERANCE, StockTask
+from manip_il.sim.config import CameraConfig
+from manip_il.worlds.contract import Outcome
+from manip_il.worlds.packaged import TOLERANCE, WHOLE, PackagedEnv, coordinates
+
+STATE_NAMES = ("gripper.x", "gripper.y", "gripper.z", "gripper.opening")
 
 
-class StockActions(ActionSpace):
+@dataclass(frozen=True)
+class FetchTask:
+    """A task of Fetch. has_object: the goal is for a cube, not for the gripper; blocked: the fingers stay closed."""
+
+    name: str
+    instruction: str
+    has_object: bool = True
+    blocked: bool = True
+    phases: ClassVar[tuple[str, ...]] = ("none", "approach", "grasp", "carry", "push", "hold")
+
+
+_TASKS = (
+    FetchTask("FetchReach-v4", "Move the gripper to the goal", has_object=False),
+    FetchTask("FetchPush-v4", "Push the cube to the goal"),
+    FetchTask("FetchPickAndPlace-v4", "Bring the cube to the goal", blocked=False),
+)
+FETCH_TASKS = {task.name: task for task in _TASKS}
+
+
+class FetchActions(ActionSpace):
     """Actions [dx, dy, dz, fingers], each in [-1, 1] in every state."""
 
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
@@ -28,39 +50,53 @@ class StockActions(ActionSpace):
 
 
 _ONES = np.ones(len(STATE_NAMES))
-ACTIONS = StockActions(STATE_NAMES, -_ONES, _ONES, np.array([1.0, 1.0, 1.0, 2.0]), np.array([True, True, True, False]))
+ACTIONS = FetchActions(STATE_NAMES, -_ONES, _ONES, np.array([1.0, 1.0, 1.0, 2.0]), np.array([True, True, True, False]))
 
 
-class StockEnv(StockBase):
+class FetchEnv(PackagedEnv):
     """An environment of gymnasium-robotics. task: the environment's name there."""
 
+    robot = "fetch_stock"
+    action_meaning = "displacement of the gripper in x, y, z [5 cm], fingers from -1 (close) to 1 (open)"
+    control_hz, horizon = 25, 50
     actions = ACTIONS
 
-    def __init__(self, task: str):
-        self.task = STOCK[task]
-        self.task_description = self.task.instruction
-        self._env = _make(self.task)
-        self.model: mujoco.MjModel = self._env.model
-        self.data: mujoco.MjData = self._env.data
+    def __init__(self, task: str, cameras: CameraConfig | None = None):
+        self.task = FETCH_TASKS[task]
+        with contextlib.redirect_stderr(io.StringIO()):  # gymnasium-robotics announces its versions there
+            import_module("gymnasium_robotics")  # which registers its names
+            self._env: Any = gymnasium.make(task, reward_type="sparse").unwrapped  # the horizon is its time limit
+        self.model = self._env.model
+        self.data = self._env.data
         self._env._mujoco_step = self._run_physics
         self.start(0)
 
+    @override
+    def observed_names(self) -> tuple[str, ...]:
+        things = ("object", "object_offset") if self.task.has_object else ()
+        turning = ("object_turn", "object_velocity", "object_spin") if self.task.has_object else ()
+        fingers = ("finger.right", "finger.left")
+        speeds = [f"{name}.velocity" for name in fingers]
+        names = (*coordinates("ee", *things), *fingers, *coordinates(*turning, "ee_velocity"), *speeds)
+        return (*names, *coordinates("goal"))
+
+    @override
     def start(self, seed: int) -> None:
-        """Begin the episode of a seed, as the environment's `reset(seed=...)` does."""
         super().start(seed)
         self._remember()
 
-    def advance(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Apply one action (4,) for one control step and return it. Raises `NotFiniteError`, `MismatchError`."""
-        super().advance(action)
+    @override
+    def step(self, action: NDArray[Any]) -> Outcome:
+        outcome = super().step(action)
         if self.task.blocked:  # with closed fingers, the environment's step has recomputed all poses
             self._remember()
-        return action
+        return outcome
 
     @property
+    @override
     def progress(self) -> float:
         """Share of the task that is done: 1 within the tolerance, 0.5 at twice that distance."""
-        left = np.linalg.norm((self.object if self.task.has_object else self.gripper) - self.goal)
+        left = np.linalg.norm(self.positions()["object" if self.task.has_object else "hand"] - self.goal)
         return TOLERANCE / max(TOLERANCE, float(left))
 
     @property
@@ -88,51 +124,42 @@ class StockEnv(StockBase):
         """Desired goal, (3,) [m]."""
         return self._env.goal
 
+    @override
     def observe(self) -> Observation:
         """Return the gripper's position and opening, (4,) [m], and the environment's own observation and goal, (k,)."""
         own = self._env._get_obs()
         state = np.append(own["observation"][:3], self.opening).astype(np.float32)
         return Observation(state, np.append(own["observation"], own["desired_goal"]).astype(np.float32))
 
+    @override
     def get_state(self) -> State:
-        """Return everything that the future depends on; `set_state` restores it bit for bit."""
-        return State(
-            np.concatenate([self._physics(), *self._begun]), self.goal.copy(), self._step, self._streak, self._ever
-        )
+        """Return MuJoCo's state, what the poses are computed from, and the goal as `variation`."""
+        state = super().get_state()
+        return replace(state, physics=np.concatenate([state.physics, self._posed]), variation=self.goal.copy())
 
+    @override
     def set_state(self, state: State) -> None:
-        """Restore a state of the same task. Raises `MismatchError` for a state of another task."""
         size, nq = mujoco.mj_stateSize(self.model, WHOLE), self.model.nq
-        if len(state.physics) != (expected := size + nq + self.model.nv) or len(state.variation) != 3:
-            raise MismatchError("size of the state", "the state", len(state.physics), self.task.name, expected)
-        physics = state.physics[:size].copy()
-        self._begun = (state.physics[size : size + nq].copy(), state.physics[size + nq :].copy())
+        self._restore(state, size + len(self._posed))
+        physics, self._posed = state.physics[:size].copy(), state.physics[size:].copy()
         mujoco.mj_setState(self.model, self.data, physics, WHOLE)
-        self.data.qpos[:], self.data.qvel[:] = self._begun
+        self.data.qpos[:] = self._posed[:nq]
+        self.data.qvel[:] = self._posed[nq:]
         mujoco.mj_fwdPosition(self.model, self.data)
         mujoco.mj_fwdVelocity(self.model, self.data)
         mujoco.mj_setState(self.model, self.data, physics, WHOLE)
         self._env.goal = state.variation.copy()
-        self._begin(state)
 
-    @property
+    @override
     def positions(self) -> dict[str, F64]:
-        """Positions (3,) [m] of the hand, and of the cube if there is one."""
         return {"hand": self.gripper} | ({"object": self.object} if self.task.has_object else {})
 
     def _remember(self) -> None:
         """Store the positions and velocities that the poses are computed from."""
-        self._begun = (self.data.qpos.copy(), self.data.qvel.copy())
+        self._posed = np.concatenate([self.data.qpos, self.data.qvel])
 
     def _run_physics(self, action: NDArray[Any]) -> None:
         """Run the environment's physics steps in two calls, to store the state before the last one."""
         mujoco.mj_step(self.model, self.data, nstep=self._env.n_substeps - 1)
         self._remember()
         mujoco.mj_step(self.model, self.data, nstep=1)
-
-
-def _make(task: StockTask) -> Any:
-    """The environment without gymnasium's wrappers: the rollout's horizon is its time limit."""
-    with contextlib.redirect_stderr(io.StringIO()):  # gymnasium-robotics announces its versions there
-        import_module("gymnasium_robotics")  # which registers its names
-        return gymnasium.make(task.name, reward_type="sparse").unwrapped

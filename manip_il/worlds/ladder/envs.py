@@ -13,8 +13,9 @@ from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import Scene, build_scene
 from manip_il.sim.task import Task
-from manip_il.tasks.config import EnvConfig, make_config
 from manip_il.tasks.table import get_task
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import make_config
 
 
 def scene_of(robot: NameOrPath, task: NameOrPath, shape: NameOrPath = "") -> Scene:
@@ -27,12 +28,12 @@ def scene_of(robot: NameOrPath, task: NameOrPath, shape: NameOrPath = "") -> Sce
 
 def config_scene(config: EnvConfig) -> Scene:
     """Return the compiled scene of an environment."""
-    return build_scene(*_parts(config), config.physics_step)
+    return build_scene(*parts_of(config), config.physics_step)
 
 
 def env_of(config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> ManipEnv:
     """Return the environment that these settings describe."""
-    return ManipEnv(*_parts(config), config, cameras=cameras, conditions=conditions)
+    return ManipEnv(*parts_of(config), config, cameras=cameras, conditions=conditions)
 
 
 def make_env(
@@ -53,8 +54,9 @@ def make_env(
     """
     config = make_config(robot, task, **settings)
     seen = CameraConfig(tuple(cameras), *image_size, look or Look()) if cameras else None
-    return ManipEnv(*_parts(config), config, cameras=seen, look=look, render_mode=render_mode, conditions=conditions)
+    return ManipEnv(*parts_of(config), config, cameras=seen, look=look, render_mode=render_mode, conditions=conditions)
 
 
-def _parts(config: EnvConfig) -> tuple[Robot, Task]:
+def parts_of(config: EnvConfig) -> tuple[Robot, Task]:
+    """Return the robot and the task of an environment."""
     return get_robot(config.robot), get_task(config.task, config.object)

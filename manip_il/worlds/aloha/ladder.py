@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.mdp import F64
 from manip_il.robots.rotations import angle_between, turned_towards
-from manip_il.tasks.stock.base import StockRung, always
-from manip_il.tasks.stock.table import SIDES, AlohaTask, Held
+from manip_il.worlds.packaged import PackagedRung, always
 
+SIDES = ("left", "right")
 FINGER_AT_TOUCH = 0.0224  # position of a finger joint at which the fingers would touch [m]
 GRASP_AHEAD = -0.002  # offset of a held object from the hand's site along the fingers [m]
 AROUND = (0.010, 0.012, 0.010)  # largest offset from that place to begin closing, in the hand's axes [m]
@@ -36,6 +35,18 @@ OPENING_STANDOFF = 0.045  # distance from an object while the fingers are not op
 OPENING_SPAN = 0.004  # range of half the gap over which that distance falls to 0 [m]
 BACK_FIRST = 0.03  # a hand that is this much too near retreats before it moves sideways [m]
 MOST_TURN = 0.3  # largest turn of an object in a step [rad]
+
+
+@dataclass(frozen=True)
+class Held:
+    """Half gaps between the fingers for one object [m]. open: smallest that clears it; thin: smallest that holds it.
+
+    long: whether the object is longest along its own x axis.
+    """
+
+    open: float
+    thin: float
+    long: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,6 +88,30 @@ class Thing:
             up = nearest(self.axes, Z)
             ahead = nearest(self.axes[:, np.abs(self.axes.T @ up) < 0.5], X)
         return np.stack([ahead, cross(up, ahead), up], axis=1)
+
+
+@dataclass(frozen=True)
+class AlohaTask:
+    """One task of `gym_aloha`. own: its name there. grasped: the hand that takes each object.
+
+    scene: the facts that its rungs read; rungs: those of each hand, latest first. inserted: an object, and the object
+    that it goes into; empty if nothing is inserted.
+    """
+
+    name: str
+    instruction: str
+    own: str
+    objects: Mapping[str, Held]
+    grasped: Mapping[str, str]
+    scene: type[AlohaScene]
+    rungs: Mapping[str, tuple[PackagedRung, ...]]
+    inserted: tuple[str, ...] = ()
+
+    @property
+    def phases(self) -> tuple[str, ...]:
+        """`none`, then `LEFT, RIGHT` for every pair of the two hands' rungs, earliest first."""
+        left, right = (self.rungs[side][::-1] for side in SIDES)
+        return ("none", *(f"{one.name}, {other.name}" for one in left for other in right))
 
 
 class AlohaScene:
@@ -127,19 +162,28 @@ class AlohaScene:
             return _within(off, HELD_AROUND) and angle < HELD_ANGLE
         return _within(off, AROUND) and angle < ANGLE
 
-    def observed(self) -> F64:
-        """Return `environment_state`, (k,), as the task's `observed` names it."""
-        numbers = list[NDArray[Any] | Sequence[float]]()
-        for hand in self.hands.values():
-            numbers += [hand.position, hand.rotation[:, 0], hand.rotation[:, 1]]
+    def observed(self) -> dict[str, F64]:
+        """Return the entries of `environment_state` by name: lengths [m], columns of rotations, contacts (0, 1)."""
+        found = dict[str, Any]()
+        for side, hand in self.hands.items():
+            found[f"{side}_ee"] = hand.position
+            found[f"{side}_ahead"] = hand.rotation[:, 0]
+            found[f"{side}_across"] = hand.rotation[:, 1]
         for name, thing in self.things.items():
-            numbers += [thing.position, thing.frame[:, 0], thing.frame[:, 2], [self.on_table(name)]]
+            found[name] = thing.position
+            found[f"{name}_ahead"] = thing.frame[:, 0]
+            found[f"{name}_up"] = thing.frame[:, 2]
+            found[f"{name}_on_table"] = self.on_table(name)
             for side, hand in self.hands.items():
-                numbers += [hand.sees(thing.position), self.touches(side, name)]
+                found[f"{name}_from_{side}"] = hand.sees(thing.position)
+                touched = zip(SIDES, self.touches(side, name), strict=True)
+                found |= {f"{name}_touched.{side}.{finger}": touches for finger, touches in touched}
         if self.task.inserted:
-            inner, outer = (self.things[name] for name in self.task.inserted)
-            numbers += [outer.frame.T @ (inner.position - outer.position), outer.frame.T @ inner.frame[:, 0]]
-        return np.concatenate([np.asarray(one, np.float64) for one in numbers])
+            one, other = self.task.inserted
+            inner, outer = self.things[one], self.things[other]
+            found[f"{one}_from_{other}"] = outer.frame.T @ (inner.position - outer.position)
+            found[f"{one}_ahead_in_{other}"] = outer.frame.T @ inner.frame[:, 0]
+        return found
 
     def _meet(self, one: str, other: str) -> bool:
         pair = {self._model.body(one).id, self._model.body(other).id}
@@ -219,13 +263,13 @@ def approach(
     return HandTarget(hand.position + way, rotation, OPEN, longest)
 
 
-def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[StockRung, StockRung]:
+def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[PackagedRung, PackagedRung]:
     """Return the rungs of a hand that takes an object from the table. grasp: scene -> the hand's rotation, (3, 3)."""
     return (
-        StockRung(
+        PackagedRung(
             "grasp", lambda one: one.is_at_grasp(side, name, grasp(one)), lambda one: close_on(one, name, grasp(one))
         ),
-        StockRung("approach", always, lambda one: approach(one, side, name, grasp(one))),
+        PackagedRung("approach", always, lambda one: approach(one, side, name, grasp(one))),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import override
 
 import numpy as np
 
@@ -10,15 +11,17 @@ from manip_il.errors import ManipError
 from manip_il.mdp import F64, Label, State
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.rotations import turned_towards
+from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import Target
 from manip_il.sim.world import Scene, World
+from manip_il.worlds.contract import Environment, Expert
 
 FALLEN = -0.05  # an object below this height has left the table [m]
 NO_PROGRESS = 0.995  # a step that leaves more than this share of the error makes no progress
 NEAR = 0.03  # distance of the hand from its target below which lack of progress is accepted [m]
 
 
-class Expert:
+class LadderExpert(Expert):
     """Labels any state of one scene.
 
     The same state gives bit-equal labels in any order and process: inverse kinematics starts from the measured joints
@@ -31,15 +34,18 @@ class Expert:
         self._task, rungs = scene.task, scene.task.rungs
         self._rungs = tuple(zip(range(len(rungs), 0, -1), rungs, strict=True))
 
-    def label(self, state: State, world: object | None = None) -> Label:
+    @override
+    def label(self, state: State, environment: Environment | ManipEnv | None = None) -> Label:
         """Return the expert's action in `state`: joint targets [rad] and gripper command [m], (n,).
 
-        world: a world of the same scene that is already in this state, with poses up to date; it is only read.
+        environment: one of the same scene that is already in this state, with poses up to date; it is only read.
 
         If there is no sound action (object out of reach, inverse kinematics without a solution), `valid` is false,
         `reason` says why, and the action holds the arm still. Raises `MismatchError` for a state of another scene.
         """
-        if not (isinstance(world, World) and world.scene is self._scene):
+        if isinstance(environment, ManipEnv) and environment.scene is self._scene:
+            world = environment.world
+        else:
             world = self._world
             world.restore(state.physics, state.variation)
         q = world.data.qpos[self._scene.arm_q]

@@ -1,0 +1,65 @@
+"""Names of worlds, and the settings of an environment by the names of robot and task."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from manip_il.option import NameOrPath, option
+from manip_il.robots import ROBOTS
+from manip_il.sim.config import Episodes
+from manip_il.sim.shape import SHAPE_HELP
+from manip_il.tasks import NAMES, SEVERAL
+
+
+class Listed(NamedTuple):
+    """What help says of a world, and the module whose `WORLD` makes it."""
+
+    module: str
+    about: str
+    tasks: tuple[str, ...]
+    cameras: tuple[str, ...] = ()
+
+
+WORLDS: dict[NameOrPath, Listed] = {
+    "fetch_stock": Listed(
+        "manip_il.worlds.fetch.expert",
+        "gymnasium-robotics' Fetch",
+        ("FetchReach-v4", "FetchPush-v4", "FetchPickAndPlace-v4"),
+    ),
+    "aloha": Listed(
+        "manip_il.worlds.aloha.expert",
+        "gym_aloha's two arms",
+        ("AlohaTransferCube-v0", "AlohaInsertion-v0"),
+        ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist"),
+    ),
+}
+ROBOT_HELP = (
+    f"{', '.join(ROBOTS)}, the path of your own arm's YAML, or, unmodified, "
+    f"{', '.join(f'{name} ({world.about})' for name, world in WORLDS.items())}"
+)
+TASK_HELP = (
+    f"{', '.join((*NAMES, *SEVERAL))}, or the path of your own task's Python file; "
+    f"{'; '.join(f'with {name}, ' + ', '.join(world.tasks) for name, world in WORLDS.items())}"
+)
+
+
+@dataclass(frozen=True)
+class EnvConfig(Episodes):
+    """Settings of one environment; every field is part of the fingerprint.
+
+    robot, task: a name, or the `Path` of a user's own file. object: shape and size of what is grasped,
+    as `ObjectShape.parse` reads it, or the `Path` of a mesh; empty for the task's default. A name that
+    was stored is a `str`, which no code
+    takes for a path.
+    """
+
+    robot: NameOrPath = option("panda", ROBOT_HELP, flag="robot.type")
+    task: NameOrPath = option("pick_place", TASK_HELP, flag="task.type")
+    object: NameOrPath = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
+
+    @property
+    def name(self) -> str:
+        """Robot and task joined by "_": a file by its name without the suffix, a task without its argument."""
+        return f"{Path(self.robot).stem}_{Path(self.task).stem.partition(':')[0]}"
