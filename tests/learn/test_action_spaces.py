@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.joined import JoinedDatasets
 from manip_il.data.schema import ACTION, STATE
 from manip_il.errors import ManipError, MismatchError
+from manip_il.learn import action_spaces
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.export import export_onnx
@@ -23,7 +25,6 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import Trainer
-from manip_il.robots import table as robots
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import LeRobotConfig
 from manip_il.robots.table import get_robot
@@ -204,7 +205,8 @@ def test_a_checkpoint_goes_on_in_its_own_space_alone(table, sources, tmp_path):
 
 
 def test_lerobots_own_training_has_no_kinematics(table, sources):
-    meta: Any = JoinedDatasets(sources)
+    [dataset] = sources
+    meta: Any = SimpleNamespace(features=JoinedDatasets(sources).features, root=dataset.root, stats={})  # as LeRobot's
     with pytest.raises(ManipError, match="train with manip-il train"):
         make_policy(make_policy_config("mlp", action_space=EE_DELTA), ds_meta=meta)
     policy: Any = make_policy(make_policy_config("mlp", action_space=JOINT_TARGET), ds_meta=meta)
@@ -219,7 +221,9 @@ def test_a_hand_moves_alike_whatever_units_its_joints_have(monkeypatch: pytest.M
     wanted = plain.encode(actions, states)
     in_degrees = np.array([180 / np.pi] * len(panda.joints) + [1.0])
     with monkeypatch.context() as patch:
-        patch.setattr(robots, "get_robot", lambda name: replace(panda, lerobot=LeRobotConfig("arm", names, (0.0, 1.0))))
+        patch.setattr(
+            action_spaces, "get_robot", lambda name: replace(panda, lerobot=LeRobotConfig("arm", names, (0.0, 1.0)))
+        )
         found = plain.encode(actions * in_degrees, states * in_degrees)
         back = plain.decode(found, states * in_degrees)
     np.testing.assert_allclose(found, wanted, atol=1e-9)
