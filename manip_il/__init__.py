@@ -26,13 +26,14 @@ _HOMES = {  # public name -> module
     "Expert": "collect.expert",
     "FitConfig": "learn.fit_config",
     "LearnedPolicy": "learn.policy",
+    "RunConfig": "algorithms.config",
     "State": "mdp",
-    "dagger": "api",
-    "evaluate": "api",
+    "dagger": "algorithms.imitation",
+    "evaluate": "evaluation.measuring",
     "make_config": "tasks.config",
     "make_env": "tasks.envs",
-    "record": "api",
-    "train": "api",
+    "record": "collect.recording",
+    "train": "learn.training",
 }
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il.cli.options import Given, given
 from manip_il.option import option
@@ -103,3 +104,9 @@ class Varied(Pictured):
     """Options of a command that randomises worlds and renders pictures."""
 
     vary: list[str] = option(list, f"what to randomise between episodes: {_CONDITIONS}; or YAML files of ranges")
+
+
+def path_options(env: Mapping[str, Any]) -> list[str]:
+    """Return the options that name files of the user's own, which no dataset, policy or result stores."""
+    named = {"--robot.type": env["robot"], "--task.type": env["task"], "--task.object": env["object"]}
+    return [f"{name}={path}" for name, path in named.items() if isinstance(path, Path)]

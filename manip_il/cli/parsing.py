@@ -27,7 +27,7 @@ from manip_il.cli.options import (
 )
 from manip_il.data.ownership import CONFIG_HEADER
 from manip_il.errors import ManipError, UsageError, nearest
-from manip_il.evaluation.policy_folder import hub_hint
+from manip_il.learn.policy_folder import hub_hint
 from manip_il.option import check_bound, type_of
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML

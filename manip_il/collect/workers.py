@@ -16,6 +16,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
+from contextlib import AbstractContextManager, nullcontext
 from itertools import islice
 from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
@@ -126,6 +127,11 @@ class Engine:
                         f"rollout workers keep dying, on seeds {self.given_up[-failed:]}; out of memory? "
                         "Finished episodes are kept"
                     )
+
+
+def engine_of(workers: int | Engine | None) -> AbstractContextManager[Engine]:
+    """Return the context of a new engine, or of a given one, which stays open."""
+    return nullcontext(workers) if isinstance(workers, Engine) else Engine(workers)
 
 
 class LocalPool:

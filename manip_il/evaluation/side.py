@@ -13,11 +13,12 @@ from manip_il.collect.workers import Engine
 from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.json_lines import read_lines
 from manip_il.errors import UsageError
-from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.results import FILE_NAME, EvalResult, require_equal
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
-from manip_il.evaluation.runner import FOLDER, Progress, Trial
+from manip_il.evaluation.runner import FOLDER, Trial
 from manip_il.evaluation.tables import DAGGER
+from manip_il.learn.policy_folder import find_policy
+from manip_il.progress import Progress
 from manip_il.tasks.config import EnvConfig
 
 _SEED_FOLDER = re.compile(r"seed_(\d+)")

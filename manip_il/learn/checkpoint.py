@@ -11,10 +11,12 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
+from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, MUST_AGREE, STATE, RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError, UnknownName
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
@@ -172,6 +174,11 @@ class Checkpoint:
             origin=origin,
             processors=processors,
         )
+
+    @cached_property
+    def sha256(self) -> str:
+        """The hash of everything that decides how the policy acts, see `policy_sha256`."""
+        return policy_sha256(self.path)
 
     @property
     def kind(self) -> str:

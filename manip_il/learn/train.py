@@ -60,7 +60,8 @@ class Trainer:
     """Policy, processors, optimiser and data of one run of behaviour cloning on labelled datasets.
 
     shares: share of the samples from each dataset. weights: how often each frame is drawn, relative to the others,
-    (N,); without either, each frame is drawn once per epoch. on_frames: called with the number of newly decoded
+    (N,); without either, each frame is drawn once per epoch. on_start: called when the inputs have been checked, before
+    anything is written. on_frames: called with the number of newly decoded
     pictures. On one CPU the same data, config and threads give the same bits, resumed or not. If started by
     `accelerate launch` or `torchrun`, every process takes `batch_size` samples per step.
 
@@ -76,6 +77,7 @@ class Trainer:
         *,
         shares: Sequence[float] = (),
         resume: bool = False,
+        on_start: Callable[[], None] | None = None,
         on_frames: Callable[[int], None] | None = None,
         weights: F64 | None = None,
     ):
@@ -86,6 +88,9 @@ class Trainer:
         self.pipeline, space = lerobot_options(config, spec.action_meaning)
         assert self.pipeline.policy is not None
         policy = self.pipeline.policy
+        columns = input_columns(config, first.root, first.info)
+        if on_start is not None:
+            on_start()
         self.accelerator = _accelerator(policy)
         self.accelerator.wait_for_everyone()  # the first process may be emptying the folder
         checkpoint = last_checkpoint(output_dir, resume=resume)
@@ -95,7 +100,7 @@ class Trainer:
         if policy.type in OWN_SPACE:
             vars(policy).update(action_space=conversion.space, grippers=conversion.grippers)
         self.meta: Any = JoinedDatasets(datasets)
-        set_features(policy, self.meta.features, input_columns(config, first.root, first.info), config.observes)
+        set_features(policy, self.meta.features, columns, config.observes)
         self.data = load_data(
             policy,
             self.meta,

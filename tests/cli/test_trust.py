@@ -17,8 +17,8 @@ from manip_il.cli.run.compare import read_plan
 from manip_il.cli.run.dagger import dagger_config
 from manip_il.cli.run.train import fit_config
 from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.lerobot_config import lerobot_options
+from manip_il.learn.policy_folder import find_policy
 
 from ..damage import edit_json
 from .made_runs import make_eval, make_policy, make_run

@@ -132,7 +132,7 @@ def measure_shift(
     plain = RolloutJob(env, hold=0, conditions=conditions)
     expert, expert_cost, _ = _run(engine, plain, seeds, on_episode)
     for number, path, datasets in rounds:
-        own, cost, success = _run(engine, replace(plain, driver=PolicyDriver((path,))), seeds, on_episode)
+        own, cost, success = _run(engine, replace(plain, driver=PolicyDriver.of(path)), seeds, on_episode)
         policy, data = LearnedPolicy.load(path), _training_states(number, datasets)
         wrong = _is_wrong(own[schema.EXECUTED_ACTION], own, scale)
         on_expert = None if policy.cameras else float(_is_wrong(_actions_on(policy, expert), expert, scale).mean())

@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from manip_il import checks
+from manip_il.algorithms.config import check_labels
+from manip_il.algorithms.imitation import check_inputs
 from manip_il.cli.common_options import EngineOptions
-from manip_il.cli.compare import CompareOptions, ComparisonOptions, StudyFile
+from manip_il.cli.compare import CompareOptions, StudyFile
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, publish
 from manip_il.cli.parsing import from_layers, from_yaml
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.cli.run.dagger import dagger_config, run_dagger
-from manip_il.cli.run.inputs import check_policy, env_config
+from manip_il.collect.inputs import check_policy, env_config
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.evaluation.comparison import FILE_NAME, Study
@@ -56,11 +58,11 @@ def _run_study(options: CompareOptions, path: Path) -> None:
     file = plan.file
     with options.output.open(file, path) as folder:
         run_plan(plan, folder, options.engine)
-        rule, sides = select_rounds(
-            Rule(file.checkpoint, file.at), [read_side(folder / name, name) for name in plan.arms]
-        )
-        trials = _trials(options, sides, plan.envs, file.eval.n_episodes)
-        _report(options, sides, trials, folder, (plan.baseline, rule, file.target), f"Study: {path.stem}", file)
+        read = [read_side(folder / name, name) for name in plan.arms]
+        rule, sides = select_rounds(Rule(file.checkpoint, file.at), read)
+        sides = _measure(options, sides, _trials(options, sides, plan.envs, file.eval.n_episodes), folder)
+        study = Study(sides, plan.baseline, rule, file.target)
+        _publish(study, folder, f"Study: {path.stem}", file)
 
 
 def _compare(options: CompareOptions, left: Path, right: Path) -> None:
@@ -78,7 +80,8 @@ def _compare(options: CompareOptions, left: Path, right: Path) -> None:
         envs = dict.fromkeys((side.name for side in both), _env(options, both))
         trials = _trials(options, both, envs, options.eval.n_episodes)
     with options.output.open(options) as folder:
-        _report(options, both, trials, folder, (both[0].name, rule), f"{left} against {right}", options)
+        study = Study(_measure(options, both, trials, folder), both[0].name, rule)
+        _publish(study, folder, f"{left} against {right}", options)
 
 
 def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
@@ -96,37 +99,28 @@ def _trials(
     options: CompareOptions, sides: Sequence[Side], envs: Mapping[str, EnvConfig], n_episodes: int
 ) -> list[Trial]:
     """Return the test of each side; raises, before any episode runs, if a policy does not fit its environment."""
-    policies = list[Path]()
+    policies = list[Checkpoint]()
     for side in sides:
-        for policy in side.policies:
-            check_policy(Checkpoint.open(policy), envs[side.name], trust=options.trust)
-            policies.append(policy)
+        for path in side.policies:
+            policies.append(Checkpoint.open(path))
+            check_policy(policies[-1], envs[side.name], trust=options.trust)
     seeds = stream_seeds("test", n_episodes, options.seed)
     return [Trial.of(envs[side.name], seeds, options.suite, policies, options.trust) for side in sides]
 
 
-def _report(
-    options: CompareOptions,
-    sides: Sequence[Side],
-    trials: Sequence[Trial],
-    folder: Path,
-    how: tuple[Any, ...],
-    title: str,
-    config: ComparisonOptions,
-) -> None:
-    """Run the tests, write the result and the report, print the tables and the verdict.
+def _measure(options: CompareOptions, sides: Sequence[Side], trials: Sequence[Trial], folder: Path) -> tuple[Side, ...]:
+    """Return the sides with their tests; without trials they are evaluations already."""
+    if not trials:
+        return tuple(sides)
+    with Stages(f"every finished episode, in {folder}") as stages, options.engine.open() as engine:
+        pairs = zip(sides, trials, strict=True)
+        return tuple(side.measure(trial, folder, engine, stages) for side, trial in pairs)
 
-    trials: of each side; none if they are evaluations. how: what `Study` takes after its sides.
-    """
-    if trials:
-        with Stages(f"every finished episode, in {folder}") as stages, options.engine.open() as engine:
-            pairs = zip(sides, trials, strict=True)
-            sides = [side.measure(trial, folder, engine, stages) for side, trial in pairs]
-    study = Study(tuple(sides), *how)
-    page = compare_report(study, title)
-    publish(
-        folder / FILE_NAME, study.to_json(), [study.table()], study.verdict, *study.facts, page=page, options=config
-    )
+
+def _publish(study: Study, folder: Path, title: str, options: Any) -> None:
+    """Write the result and the report, print the tables and the verdict."""
+    page, tables = compare_report(study, title), [study.table()]
+    publish(folder / FILE_NAME, study.to_json(), tables, study.verdict, *study.facts, page=page, options=options)
 
 
 class StudyPlan(NamedTuple):
@@ -166,12 +160,15 @@ def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False
             if found := next((one for one in _OF_STUDY for _, tree in layers if one in (tree or {})), None):
                 raise UsageError(f"{found} is set by the study for every run; remove it")
             arms[name] = replace(from_layers(DaggerOptions, layers), trust=trust)
-            envs[name] = dagger_config(arms[name]).env
+            config = dagger_config(arms[name])
+            check_labels(config)
+            check_inputs(config)
+            envs[name] = config.env
         except ManipError as error:
             raise UsageError(f"{path}: arm {name!r}: {error}") from error
+    if file.baseline is not None and file.baseline not in envs:
+        raise UnknownName("baseline", file.baseline, envs)
     if file.baseline is None and len({env.task for env in envs.values()}) > 1:
         return StudyPlan(file, arms, envs, None)
     require_same_env(envs)
-    if file.baseline is not None and file.baseline not in envs:
-        raise UnknownName("baseline", file.baseline, envs)
     return StudyPlan(file, arms, envs, file.baseline or next(iter(envs)))

@@ -8,22 +8,23 @@ from dataclasses import replace
 from pathlib import Path
 
 from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.imitation import dagger
 from manip_il.algorithms.results import best_result
 from manip_il.algorithms.run import Run
+from manip_il.cli.common_options import path_options
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.demo import DemoOptions
-from manip_il.cli.outputs import REPORT_FILE
+from manip_il.cli.outputs import REPORT_FILE, about
 from manip_il.cli.progress import Stages, say, say_next
-from manip_il.cli.run.dagger import dagger_config, run_rounds, write_run_page
-from manip_il.cli.run.inputs import env_options
+from manip_il.cli.run.dagger import dagger_config
 from manip_il.collect.workers import Engine
 from manip_il.evaluation.comparison import Comparison
-from manip_il.evaluation.eval_report import success_table
+from manip_il.evaluation.eval_report import run_report, success_table
 from manip_il.evaluation.film import collect_films, film_episode, run_states
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.runner import Trial
-from manip_il.evaluation.side import Side
-from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT, print_table
+from manip_il.evaluation.side import Side, read_member
+from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
 from manip_il.seeding import stream_seeds
 
 ENOUGH = 1.25  # demonstrations to record, relative to the number that should give enough labels
@@ -34,7 +35,6 @@ def run_demo(options: DemoOptions) -> None:
     config = dagger_config(DaggerOptions(env=options.env, settings=options.settings, fit=options.fit))
     kept = f"every finished episode, round and evaluation, in {options.output.output_dir}"
     with options.output.open(options) as folder, Stages(kept) as stages, options.engine.open() as engine:
-        engine.warm_up(learned=True)
         policies, sides = _measure(options, config, folder, engine, stages)
         films, no_films = _film(policies, sides, config, stages)
     disturbed = [Side.of(side.name, side.disturbed) for side in sides if side.disturbed]
@@ -44,13 +44,22 @@ def run_demo(options: DemoOptions) -> None:
         for place in (2, 1)  # cloning from as many labels, then round 0
     )
     facts.append(f"{config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.")
-    parts = {"title": f"Demo: {config.env.robot} {config.env.task}", "verdict": verdict, "facts": tuple(facts)}
-    parts |= {"films": films, "no_films": no_films}
-    write_run_page(options, folder, folder / "dagger", sides, "DAgger", **parts)
-    print_table(success_table(sides))
+    page = run_report(
+        sides,
+        [Side("DAgger", (read_member(folder / "dagger"),))],
+        films,
+        no_films,
+        title=f"Demo: {config.env.robot} {config.env.task}",
+        verdict=verdict,
+        facts=tuple(facts),
+        fingerprint=sides[-1].results[0].fingerprint,
+        **about(options),
+    )
+    page.write(folder / REPORT_FILE)
+    success_table(sides).print()
     say(verdict, *facts)
     say(f"report: {folder / REPORT_FILE}")
-    words = f"--policy.path={policies[-1]}", *env_options(config.env), "--eval.films=3"
+    words = f"--policy.path={policies[-1]}", *path_options(vars(config.env)), "--eval.films=3"
     say_next("eval", *words, f"--output_dir={folder}_eval")
 
 
@@ -58,10 +67,10 @@ def _measure(
     options: DemoOptions, config: RunConfig, folder: Path, engine: Engine, stages: Stages
 ) -> tuple[list[Path | None], list[Side]]:
     """Run DAgger, clone from as many labels, and test both, round 0 and the expert (policy None)."""
-    results = run_rounds(config, folder / "dagger", engine, stages)
+    results = dagger(folder / "dagger", config, workers=engine, progress=stages)
     first, best = results[0], best_result(results)
     most = results[-1].labels
-    run = Run(replace(config, label_budget=most), folder / f"cloning_{most}", engine, stages.watch())
+    run = Run(replace(config, label_budget=most), folder / f"cloning_{most}", engine, stages)
     more = run.demonstrations(math.ceil(ENOUGH * config.demonstrations * most / first.labels))
     policy = run.fit([more]).path
     trials = [
@@ -88,8 +97,8 @@ def _film(
     policies: Sequence[Path | None], sides: Sequence[Side], config: RunConfig, stages: Stages
 ) -> tuple[list[Film], str]:
     """Film every policy on the first seed on which DAgger succeeds and cloning fails, else on the first seed."""
-    cloned, dagger = sides[1].results[0].episodes, sides[-1].results[0].episodes
-    won = {episode.seed for episode in dagger if episode.success}
+    cloned, best = sides[1].results[0].episodes, sides[-1].results[0].episodes
+    won = {episode.seed for episode in best if episode.success}
     seed = next((one.seed for one in cloned if not one.success and one.seed in won), cloned[0].seed)
     trial = Trial.of(config.env, range(seed, seed + 1), "nominal")
 

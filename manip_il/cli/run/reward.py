@@ -12,7 +12,7 @@ from manip_il.cli.progress import progress, say, say_next
 from manip_il.cli.reward import AnswerOptions, AskOptions, FitOptions, OfPairs, PairsOptions
 from manip_il.data.atomic import write_file, write_json
 from manip_il.data.dataset import Dataset
-from manip_il.evaluation.policy_folder import find_policy
+from manip_il.learn.policy_folder import find_policy
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.seeding import rng_for, stream_base
 

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 from manip_il import checks
-from manip_il.cli.outputs import OutputFile, publish, write_page
+from manip_il.cli.outputs import OutputFile, about, publish
 from manip_il.cli.progress import progress, say, say_next
 from manip_il.cli.robot import CertifyOptions, RobotCheckOptions, RobotNewOptions
-from manip_il.cli.run.inputs import env_config
+from manip_il.collect.inputs import env_config
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_file, write_json
 from manip_il.errors import ManipError
 from manip_il.evaluation import robot_check
 from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
 from manip_il.evaluation.robot_check import advice, check_robot, verdict
-from manip_il.evaluation.tables import print_table
 from manip_il.robots.gripper import sweep
 from manip_il.robots.suggest import suggest, yaml_of
 from manip_il.robots.table import get_robot
@@ -52,8 +52,8 @@ def run_robot_check(options: RobotCheckOptions) -> None:
         with progress(2 * options.episodes * len(tasks), f"check {options.robot}") as bar, Engine(None) as engine:
             found = robot_check.check_robot(options.robot, tasks, options.episodes, engine, lambda _: bar.step())
         write_json(folder / robot_check.FILE_NAME, found.to_json())
-        write_page(robot_check.check_report(found), folder / PAGE, options)
-    print_table(robot_check.task_table(found))
+        replace(robot_check.check_report(found), **about(options)).write(folder / PAGE)
+    robot_check.task_table(found).print()
     say(robot_check.verdict(found), *(f"change: {line}" for line in robot_check.advice(found)))
     say(f"page: {folder / PAGE}")
     if found.failed:

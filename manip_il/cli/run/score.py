@@ -10,7 +10,7 @@ from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.data_check import ScoreOptions
 from manip_il.cli.outputs import publish
 from manip_il.errors import ManipError
-from manip_il.evaluation.policy_folder import find_policy
+from manip_il.learn.policy_folder import find_policy
 
 PROGRESS = "progress"  # value of --reward: score by true progress
 

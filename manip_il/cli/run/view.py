@@ -8,13 +8,12 @@ from dataclasses import replace
 
 from manip_il.cli.common_options import default_cameras
 from manip_il.cli.progress import say
-from manip_il.cli.run.inputs import open_driver
 from manip_il.cli.view import IN_A_FILE, ViewOptions
 from manip_il.collect.environments import make_env
-from manip_il.collect.job import RolloutJob, observed_cameras, run_steps
+from manip_il.collect.job import HOLD, RolloutJob, observed_cameras, run_steps
 from manip_il.collect.rollout import Environment
 from manip_il.errors import UsageError
-from manip_il.evaluation.runner import HOLD
+from manip_il.evaluation.measuring import open_driver
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.evaluation.watch import RerunLog, WindowScreen, outcome
 from manip_il.mdp import LONGEST_EPISODE
@@ -32,7 +31,7 @@ def run_view(options: ViewOptions) -> None:
     """Run episodes and show them."""
     in_window, sliders = options.output is None and has_display(), options.policy.type == "sliders"
     env, driver, cameras = open_driver(
-        options.policy.path, options.policy.type or "expert", options.env, trust=options.trust
+        options.policy.path, options.env, options.policy.type or "expert", trust=options.trust
     )
     in_window = in_window and env.robot not in STOCK
     if sliders and not in_window:
