@@ -39,6 +39,13 @@ def option(default: Any, help_text: str, **metadata: Any) -> Any:
     return field(default=default, metadata=metadata)
 
 
+def keyword(default: Any, help_text: str, **metadata: Any) -> Any:
+    """Return a field like `option`, which stays a keyword if a class without `kw_only` declares it again."""
+    made = option(Path(default) if isinstance(default, str) else default, help_text, **metadata)
+    made.kw_only = True
+    return made
+
+
 def bounded(default: Any, low: float, high: float) -> Any:
     """Return a dataclass field that is no option, but has the bounds of one."""
     return field(default=default, metadata={"at_least": low, "at_most": high})

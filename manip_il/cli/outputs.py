@@ -14,7 +14,7 @@ from manip_il.cli.progress import say
 from manip_il.data.atomic import clear, exclusive, write_file, write_json
 from manip_il.data.ownership import CONFIG_FILE, PARTIAL, is_our_file, kind_of, output_of, require_replaceable
 from manip_il.errors import MismatchError, UsageError
-from manip_il.option import option
+from manip_il.option import keyword, option
 
 if TYPE_CHECKING:
     from manip_il.evaluation.report import Report
@@ -37,38 +37,50 @@ class Resumable(Replacing):
     resume: bool = option(False, "continue an interrupted run", free=True)
 
 
-@dataclass(frozen=True)
+def output_folder(default: Any = MISSING) -> Any:
+    """Return the field of a command's output folder."""
+    return keyword(default, "output folder", free=True)
+
+
+def output_file(default: Any = MISSING) -> Any:
+    """Return the field of a command's output file."""
+    return keyword(default, "output file")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Output(Replacing):
     """The output folder of a command."""
 
-    output_dir: Path = option(MISSING, "output folder", free=True)
+    output_dir: Path = output_folder()
 
     @contextmanager
-    def open(self, options: Any, *sources: Path) -> Generator[Path]:
+    def open(self, *sources: Path, saved: Any = None) -> Generator[Path]:
         """Lock and prepare the folder, and write the options to `config.yaml`; a resumed run must have the same ones.
 
-        Raises what `prepare_output` and `check_same_options` raise.
+        sources: further inputs, which must not be replaced. saved: options to write in place of the command's. Raises
+        what `prepare_output` and `check_same_options` raise.
         """
-        with self.lock(options, *sources) as prepare:
+        with self.lock(*sources, saved=saved) as prepare:
             prepare()
             yield self.output_dir
 
-    def lock(self, options: Any, *sources: Path) -> Any:
+    def lock(self, *sources: Path, saved: Any = None) -> Any:
         """Return a context manager like `open`, in which a function that it yields prepares the folder."""
+        options = saved or self
         kinds = {self.output_dir: output_of(type(options).__name__)}
         return locked(kinds, self, options, [*_inputs(options), *sources])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ResumableOutput(Output, Resumable):
     """The output folder of a command that can be resumed."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class OutputFile(Replacing):
     """The output file of a command."""
 
-    output: Path = option(MISSING, "output file")
+    output: Path = output_file()
 
     def check(self) -> None:
         """Raise `UsageError` if the file exists, unless it may be replaced and this program wrote it."""

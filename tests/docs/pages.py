@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from manip_il.cli.main import COMMANDS, load
+from manip_il.cli.main import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (
@@ -101,7 +101,9 @@ def help_lines() -> list[Line]:
     """The example in the help of every command, and that of `manip-il --help`."""
     from manip_il.cli.main import _help
 
-    examples = {f"{name} --help": load(name).example for name in COMMANDS}
+    examples = {
+        f"{name} --help": " ".join(str(load(name).__doc__).rpartition("Example: ")[2].split()) for name in COMMANDS
+    }
     first = _help().rpartition("example: ")[2]
     assert first in examples.values(), f"manip-il --help: {first!r} is not the example of its command"
     return [Line(f"manip-il {name}", tuple(shlex.split(text))) for name, text in examples.items()]

@@ -13,7 +13,7 @@ from manip_il.algorithms.imitation import check_inputs
 from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.compare import CompareOptions, StudyFile
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, publish
+from manip_il.cli.outputs import REPORT_FILE, publish
 from manip_il.cli.parsing import from_layers, from_yaml
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.cli.run.dagger import dagger_config, run_dagger
@@ -56,8 +56,8 @@ def _refuse(options: CompareOptions, why: str, *names: str) -> None:
 def _run_study(options: CompareOptions, path: Path) -> None:
     plan = read_plan(path, options.training_seeds, options.trust)
     file = plan.file
-    with options.output.open(file, path) as folder:
-        run_plan(plan, folder, options.engine)
+    with options.open(path, saved=file) as folder:
+        run_plan(plan, folder, options)
         read = [read_side(folder / name, name) for name in plan.arms]
         rule, sides = select_rounds(Rule(file.checkpoint, file.at), read)
         sides = _measure(options, sides, _trials(options, sides, plan.envs, file.eval.n_episodes), folder)
@@ -79,7 +79,7 @@ def _compare(options: CompareOptions, left: Path, right: Path) -> None:
     else:
         envs = dict.fromkeys((side.name for side in both), _env(options, both))
         trials = _trials(options, both, envs, options.eval.n_episodes)
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         study = Study(_measure(options, both, trials, folder), both[0].name, rule)
         _publish(study, folder, f"{left} against {right}", options)
 
@@ -112,7 +112,7 @@ def _measure(options: CompareOptions, sides: Sequence[Side], trials: Sequence[Tr
     """Return the sides with their tests; without trials they are evaluations already."""
     if not trials:
         return tuple(sides)
-    with Stages(f"every finished episode, in {folder}") as stages, options.engine.open() as engine:
+    with Stages(f"every finished episode, in {folder}") as stages, options.open_engine() as engine:
         pairs = zip(sides, trials, strict=True)
         return tuple(side.measure(trial, folder, engine, stages) for side, trial in pairs)
 
@@ -136,11 +136,20 @@ def run_plan(plan: StudyPlan, root: Path, engine: EngineOptions) -> None:
     """Run the missing runs, seed by seed, so that a study that is stopped early has runs of every arm."""
     runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
     for number, (name, seed) in enumerate(runs, start=1):
-        output = ResumableOutput(root / name / f"seed_{seed}", resume=True)
-        if not (output.output_dir / REPORT_FILE).is_file():  # the file that a run writes last
+        output = root / name / f"seed_{seed}"
+        if not (output / REPORT_FILE).is_file():  # the file that a run writes last
             say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
             arm = plan.arms[name]
-            run_dagger(replace(arm, settings=arm.settings | {"seed": seed}, output=output, engine=engine))
+            run_dagger(
+                replace(
+                    arm,
+                    settings=arm.settings | {"seed": seed},
+                    output_dir=output,
+                    resume=True,
+                    workers=engine.workers,
+                    engine=engine.engine,
+                )
+            )
 
 
 def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False) -> StudyPlan:

@@ -27,9 +27,9 @@ from manip_il.tasks.config import EnvConfig
 
 def run_dagger(options: DaggerOptions) -> None:
     """Run all rounds, or continue them."""
-    config, folder = dagger_config(options), options.output.output_dir
+    config, folder = dagger_config(options), options.output_dir
     kept = f"every finished episode and round, in {folder}"
-    with options.output.lock(options) as prepare, Stages(kept, prepare) as stages, options.engine.open() as engine:
+    with options.lock() as prepare, Stages(kept, prepare) as stages, options.open_engine() as engine:
         results = dagger(folder, config, workers=engine, progress=stages)
         kind = ALGORITHMS[config.method]
         page = validation_report(

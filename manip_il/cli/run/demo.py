@@ -33,8 +33,8 @@ ENOUGH = 1.25  # demonstrations to record, relative to the number that should gi
 def run_demo(options: DemoOptions) -> None:
     """Run the missing steps, print the table, write the report."""
     config = dagger_config(DaggerOptions(env=options.env, settings=options.settings, fit=options.fit))
-    kept = f"every finished episode, round and evaluation, in {options.output.output_dir}"
-    with options.output.open(options) as folder, Stages(kept) as stages, options.engine.open() as engine:
+    kept = f"every finished episode, round and evaluation, in {options.output_dir}"
+    with options.open() as folder, Stages(kept) as stages, options.open_engine() as engine:
         policies, sides = _measure(options, config, folder, engine, stages)
         films, no_films = _film(policies, sides, config, stages)
     disturbed = [Side.of(side.name, side.disturbed) for side in sides if side.disturbed]

@@ -41,11 +41,11 @@ def run_eval(options: EvalOptions) -> None:
 
 
 def _evaluate(options: EvalOptions) -> None:
-    folder, policy, how = options.output.output_dir, options.policy, options.eval
+    folder, policy, how = options.output_dir, options.policy, options.eval
     with (
-        options.output.lock(options) as prepare,
+        options.lock() as prepare,
         Stages(f"finished episodes, in {folder}", prepare) as stages,
-        options.engine.open() as engine,
+        options.open_engine() as engine,
     ):
         result = evaluate(
             policy.path,
@@ -80,7 +80,7 @@ def _merge(options: EvalOptions) -> None:
     merged, ((first, one), *others) = merge_results(parts), parts.items()
     for name, other in others:
         warn(*compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         tables = [success_table(condition_sides(merged))]
         publish(folder / FILE_NAME, merged.to_json(), tables, page=eval_report(merged), options=options)
 
@@ -88,7 +88,7 @@ def _merge(options: EvalOptions) -> None:
 def _replay(options: EvalOptions, file: Path, seed: int) -> None:
     """Replay one episode with the same policy, seed and conditions; `ManipError` if its outcome differs."""
     if options.video is not None:
-        OutputFile(options.video, overwrite=options.output.overwrite).check()
+        OutputFile(output=options.video, overwrite=options.overwrite).check()
     own = {name: options.env[name] for name in ("robot", "task", "object")}
     again = replay(file, seed, options.policy.path, **own, trust=options.trust)
     before = again.before

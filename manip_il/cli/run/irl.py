@@ -17,7 +17,7 @@ def run_irl(options: IrlOptions) -> None:
     rng = rng_for(stream_base("training", options.seed), "irl")
     learnt = learn(options.method, [one.demonstration for one in carried], rng)
     found = inverse.Inverse(str(options.dataset), tuple(carried), learnt)
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         page = inverse.inverse_report(found)
         publish(folder / inverse.FILE_NAME, found.to_json(), [inverse.weight_table(found)], page=page, options=options)
     say_next("eval", "--policy.type=expert", f"--task.type=carry:{folder / inverse.FILE_NAME}")

@@ -27,9 +27,9 @@ from manip_il.tasks.config import stored_config
 
 def _run(options: Learning, config: LearningConfig) -> None:
     """Run all iterations, or continue them, and write the report."""
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         kept = f"every finished iteration, in {folder}"
-        with Stages(kept) as stages, options.engine.open() as engine:
+        with Stages(kept) as stages, options.open_engine() as engine:
             watch = Progress()
             vars(watch).update(dict.fromkeys(("episode", "step"), lambda *_: stages.check()))
             stages.start(f"{options.method.upper()}, steps", config.steps)

@@ -27,7 +27,7 @@ def run_record(options: RecordOptions) -> None:
     with (
         locked({root: DATASET, journals: EPISODES}, options, options) as prepare,
         Stages(kept, prepare) as stages,
-        options.engine.open() as engine,
+        options.open_engine() as engine,
     ):
         made = record(
             root,

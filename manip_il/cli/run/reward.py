@@ -24,36 +24,36 @@ def sources_option(options: OfPairs | PairsOptions) -> str:
 
 def run_pairs(options: PairsOptions) -> None:
     """Read the sources, choose, and write the pairs."""
-    options.file.check()
+    options.check()
     reward = LearnedReward.load(find_policy(options.reward)) if options.reward else None
     rng = rng_for(stream_base("training", options.seed), "pairs")
     clips = choose_pairs(find_datasets(options.sources), options.clip, options.count, options.seed, rng, reward)
-    write_json(options.file.output, clips.pairs.to_json())
-    say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {options.file.output}")
-    say_next("reward", "ask", options.file.output, sources_option(options), "--output=ask.html")
+    write_json(options.output, clips.pairs.to_json())
+    say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {options.output}")
+    say_next("reward", "ask", options.output, sources_option(options), "--output=ask.html")
 
 
 def run_ask(options: AskOptions) -> None:
     """Render the films and write the page."""
-    options.file.check()
+    options.check()
     clips = read_clips(Pairs.read(options.pairs), find_datasets(options.sources))
     with progress(len(clips.pairs), "render") as bar:
         films = render_films(clips, options.robot, bar.step)
     page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
-    write_file(options.file.output, page.encode())
-    say(f"{len(clips.pairs):,} pairs: {options.file.output}")
+    write_file(options.output, page.encode())
+    say(f"{len(clips.pairs):,} pairs: {options.output}")
     say_next("reward", "fit", options.pairs, "preferences.json", sources_option(options), "--output_dir=runs/reward")
 
 
 def run_answer(options: AnswerOptions) -> None:
     """Compare every pair and write the answers."""
-    options.file.check()
+    options.check()
     teacher = Teacher.parse(options.teacher)
     clips = read_clips(Pairs.read(options.pairs), find_datasets(options.sources))
     rng = rng_for(stream_base("training", options.seed), "teacher")
-    write_json(options.file.output, answer_pairs(teacher, clips, rng).to_json())
-    say(f"{len(clips.pairs):,} answers: {options.file.output}")
-    say_next("reward", "fit", options.pairs, options.file.output, sources_option(options), "--output_dir=runs/reward")
+    write_json(options.output, answer_pairs(teacher, clips, rng).to_json())
+    say(f"{len(clips.pairs):,} answers: {options.output}")
+    say_next("reward", "fit", options.pairs, options.output, sources_option(options), "--output_dir=runs/reward")
 
 
 def run_fit(options: FitOptions) -> None:
@@ -66,7 +66,7 @@ def run_fit(options: FitOptions) -> None:
         found = fit_answers(clips, answers, shape, stream_base("training", options.seed), bar.step)
     fingerprint = Dataset.open(clips.roots[0]).fingerprint
     stored = {"seed": options.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.clip}
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         target = folder / PRETRAINED_MODEL
         target.mkdir(parents=True, exist_ok=True)
         write_reward(target, found.fit.network, found.shape, clips.frames[0].spec, stored, fingerprint)

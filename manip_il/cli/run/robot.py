@@ -29,7 +29,7 @@ def run_robot_new(options: RobotNewOptions) -> None:
     """Write the YAML file, check the robot, print what is left to do. Raises `ManipError` if it can do no task."""
     target = options.output or options.model.with_suffix(".yaml")
     checks.name(f"the name of {target}, which becomes the robot's,", target.stem)
-    OutputFile(target, overwrite=options.overwrite).check()
+    OutputFile(output=target, overwrite=options.overwrite).check()
     paths = [os.path.relpath(path, target.parent) if path else "" for path in (options.model, options.gripper)]
     found = suggest(options.model, options.gripper)
     write_file(target, yaml_of(found, *paths).encode())
@@ -48,7 +48,7 @@ def run_robot_check(options: RobotCheckOptions) -> None:
     tasks = options.tasks or list(NAMES)
     for task in tasks:
         get_task(task)
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         with progress(2 * options.episodes * len(tasks), f"check {options.robot}") as bar, Engine(None) as engine:
             found = robot_check.check_robot(options.robot, tasks, options.episodes, engine, lambda _: bar.step())
         write_json(folder / robot_check.FILE_NAME, found.to_json())
@@ -64,9 +64,9 @@ def run_robot_check(options: RobotCheckOptions) -> None:
 def run_certify(options: CertifyOptions) -> None:
     """Run the episodes, write `certificate.json`, print the tables."""
     env = env_config(options.env)
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         count = count_episodes(env, options.cases)
-        with progress(count, f"certify {env.robot} {env.task}") as bar, options.engine.open() as engine:
+        with progress(count, f"certify {env.robot} {env.task}") as bar, options.open_engine() as engine:
             certificate = certify(engine, env, options.cases, options.seed, lambda _: bar.step())
         mu = certificate.mu
         lines = () if mu is None else (f"u of Ross et al. (2011) is at least {mu} steps",)

@@ -16,10 +16,10 @@ def run_train(options: TrainOptions) -> None:
     writes = os.environ.get(RANK, "0") == "0"  # only the first of several processes writes
     if not writes:
         set_quiet(True)
-    folder = options.output.output_dir
+    folder = options.output_dir
     datasets = [*map(open_dataset, options.dataset.root)]
     kept = f"every finished checkpoint, in {folder}"
-    output = options.output.lock(options) if writes else contextlib.nullcontext()
+    output = options.lock() if writes else contextlib.nullcontext()
     with output as prepare, Stages(kept, prepare) as stages:
         policy = train(
             datasets,
@@ -27,7 +27,7 @@ def run_train(options: TrainOptions) -> None:
             seed=options.seed,
             shares=options.dataset.weights,
             weights=options.weights,
-            resume=options.output.resume,
+            resume=options.resume,
             progress=stages,
             trust=options.trust,
             **options.fit,
