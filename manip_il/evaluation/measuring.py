@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -20,8 +21,9 @@ from manip_il.evaluation.eval_report import eval_report
 from manip_il.evaluation.film import film_outcomes, run_states
 from manip_il.evaluation.report import REPORT_FILE
 from manip_il.evaluation.results import EpisodeResult, EvalResult, require_equal
-from manip_il.evaluation.runner import episode_hold, episode_result, measure, replay_differences
+from manip_il.evaluation.runner import FOLDER, episode_hold, episode_result, measure, replay_differences
 from manip_il.evaluation.runner import evaluate as run_episodes
+from manip_il.evaluation.side import Side
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.policy_folder import policy_folder
@@ -29,6 +31,7 @@ from manip_il.mdp import Episode
 from manip_il.option import NameOrPath, make_options
 from manip_il.progress import Progress
 from manip_il.seeding import BLOCK, stream_seeds
+from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.config import CameraConfig
 from manip_il.tasks.config import EnvConfig, env_of_name
 
@@ -44,7 +47,7 @@ def evaluate(
     episodes: int | None = None,
     *,
     kind: str = "expert",
-    suite: str = "nominal",
+    suite: str = "",
     stream: Literal["test", "validation"] = "test",
     first: int = 0,
     seed: int = 0,
@@ -66,16 +69,15 @@ def evaluate(
         env: The environment, its name, or those of its settings that differ from the policy's training environment.
         episodes: Number of episodes, by default 100; at most 10,000 with `until_width`.
         kind: Who drives without a policy: expert or random.
-        suite: Test conditions, unless `conditions` is among the options.
+        suite: Test conditions, by default nominal; or only their name, if `conditions` is among the options.
         stream: Which stream of seeds.
         first: Index of the first seed in the stream.
         seed: 0 to 1000.
         hold: Control steps after success until an episode ends; None: it ends at the horizon.
         until_width: Stop when the confidence interval is this narrow.
-        output_dir: Folder for the finished episodes, `eval.json` and `report.html`; finished episodes are not run
-            again.
+        output_dir: Folder for `eval.json` and the finished episodes, which are not run again.
         films: Number of failures to film for the report, and of successes.
-        about: Further fields of the report.
+        about: Further fields of the report, `report.html` in the folder; None for no report.
         workers: Number of processes, None for one per core; or the engine to use.
         trust: Whether to load models and code that the checkpoint names.
         device: Where the policy runs.
@@ -94,9 +96,9 @@ def evaluate(
         engine.warm_up(learned=policy is not None)  # meanwhile this process checks the policy
         env, driver, cameras = open_driver(policy, env, kind, trust=trust, device=device)
         if "conditions" not in options:
+            suite = suite or NOMINAL.name
             options["conditions"] = suite_conditions(suite, env, sees=cameras is not None)
-        elif options["conditions"]:
-            suite = "_".join(one.name for one in options["conditions"])
+        suite = suite or "_".join(one.name for one in options["conditions"])
         chosen: dict[str, Any] = {"hold": episode_hold(env, hold), "label": "last"}
         job = make_options(RolloutJob, env=env, driver=driver, **chosen | options)
         most = 100 if until_width is None else _MOST_UNTIL_WIDTH
@@ -108,8 +110,58 @@ def evaluate(
             return run_episodes(engine, job, seeds, name, progress.episode, suite=suite, until_width=until_width)
         result = measure(engine, job, seeds, name, output_dir, progress, suite=suite, until_width=until_width)
         made = film_outcomes(engine, job, result, films, progress)
-    replace(eval_report(result, *made), **about or {}).write(output_dir / REPORT_FILE)
+    if about is not None:
+        replace(eval_report(result, *made), **about).write(output_dir / REPORT_FILE)
     return result
+
+
+def measure_sides(
+    sides: Sequence[Side],
+    envs: Mapping[str, EnvConfig],
+    folder: Path,
+    *,
+    episodes: int,
+    suite: str,
+    seed: int = 0,
+    trust: bool = False,
+    engine: Engine,
+    progress: Progress,
+) -> tuple[Side, ...]:
+    """Evaluate the policies of a comparison on the same seeds; finished episodes in the folder are not run again.
+
+    Args:
+        sides: The sides; their members have policies.
+        envs: Name of a side -> its environment.
+        folder: Folder for the evaluations.
+        episodes: Number of test episodes.
+        suite: Test conditions; those on cameras count only if some policy uses cameras.
+        seed: 0 to 1000.
+        trust: Whether to load models and code that a checkpoint names.
+        engine: Runs the episodes.
+        progress: Follows the evaluations.
+
+    Returns:
+        The sides, with the results of their members.
+
+    Raises:
+        MismatchError: before any episode runs, if a policy does not fit its environment.
+    """
+    members = [(envs[side.name], member) for side in sides for member in side.members]
+    drivers = [open_driver(member.policy, env, trust=trust) for env, member in members]
+    sees = any(cameras for *_, cameras in drivers)
+    seeds = stream_seeds("test", episodes, seed)
+    results = list[EvalResult]()
+    progress.started()
+    for (env, driver, _), (_, member) in zip(drivers, members, strict=True):
+        conditions = suite_conditions(suite, env, sees=sees)
+        job = RolloutJob(env, driver, episode_hold(env), label="last", conditions=conditions)
+        digest = job.policy.sha256[:8] if job.policy else driver.name
+        words = f"{re.sub(r'[^A-Za-z0-9]+', '_', member.name)[-80:]}_{digest}"
+        results.append(measure(engine, job, seeds, member.name, folder / FOLDER / words, progress, suite=suite))
+    found = iter(results)
+    return tuple(
+        replace(side, members=tuple(replace(member, result=next(found)) for member in side.members)) for side in sides
+    )
 
 
 def open_driver(

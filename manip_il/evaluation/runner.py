@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from manip_il.caching import PerThread
-from manip_il.collect.drivers import ExpertDriver, PolicyDriver
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import HOLD, RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
@@ -21,11 +19,9 @@ from manip_il.data.json_lines import append_line, read_lines
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, EvalSettings
-from manip_il.evaluation.suites import suite_conditions
-from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import F64, Episode, State
 from manip_il.progress import Progress
-from manip_il.sim.conditions import NOMINAL, Condition, draw, turn_of
+from manip_il.sim.conditions import NOMINAL, draw, turn_of
 from manip_il.sim.task import objects_in
 from manip_il.sim.world import World
 from manip_il.tasks.config import EnvConfig
@@ -206,33 +202,3 @@ def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]
         raise MismatchError("what is drawn for the episode", "the file", drawn, "the replay", now["drawn"])
     compared = ("success", "success_at_end", "steps", "return")
     return [f"{name} was {was[name]}, is {now[name]}" for name in compared if was[name] != now[name]]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Environment, seeds and conditions of a test; trust: whether to load models that checkpoints refer to."""
-
-    env: EnvConfig
-    seeds: range
-    suite: str = "nominal"
-    conditions: tuple[Condition, ...] = ()
-    trust: bool = False
-
-    @classmethod
-    def of(
-        cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Checkpoint] = (), trust: bool = False
-    ) -> Trial:
-        """Return a trial under a suite's conditions, without camera conditions if no policy uses cameras."""
-        sees = any(policy.pictures for policy in policies)
-        return cls(env, seeds, suite, suite_conditions(suite, env, sees=sees), trust)
-
-    def job(self, policy: Checkpoint | Path | None) -> RolloutJob:
-        """Return the job that runs a policy, or the expert if it is None."""
-        driver = ExpertDriver() if policy is None else PolicyDriver.of(policy, trust=self.trust)
-        return RolloutJob(self.env, driver, episode_hold(self.env), label="last", conditions=self.conditions)
-
-    def measure(
-        self, policy: Checkpoint | Path | None, name: str, folder: Path, engine: Engine, progress: Progress
-    ) -> EvalResult:
-        """Return the evaluation of a policy, or of the expert, in `folder`; see the function `measure`."""
-        return measure(engine, self.job(policy), self.seeds, name, folder, progress, suite=self.suite)

@@ -11,22 +11,21 @@ from manip_il import checks
 from manip_il.algorithms.config import check_labels
 from manip_il.algorithms.imitation import check_inputs
 from manip_il.cli.common_options import EngineOptions
-from manip_il.cli.compare import CompareOptions, StudyFile
+from manip_il.cli.compare import CompareOptions, ComparisonOptions, StudyFile
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.outputs import REPORT_FILE, publish
 from manip_il.cli.parsing import from_layers, from_yaml
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.cli.run.dagger import dagger_config, run_dagger
-from manip_il.collect.inputs import check_policy, env_config
+from manip_il.collect.inputs import env_config
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.evaluation.comparison import FILE_NAME, Study
 from manip_il.evaluation.eval_report import compare_report
+from manip_il.evaluation.measuring import measure_sides
 from manip_il.evaluation.rounds import Rule
-from manip_il.evaluation.runner import Trial
 from manip_il.evaluation.side import Side, read_side, require_pair, require_same_env, select_rounds
 from manip_il.learn.checkpoint import Checkpoint
-from manip_il.seeding import stream_seeds
 from manip_il.tasks.config import EnvConfig
 
 _YAML = (".yaml", ".yml")
@@ -56,12 +55,11 @@ def _refuse(options: CompareOptions, why: str, *names: str) -> None:
 def _run_study(options: CompareOptions, path: Path) -> None:
     plan = read_plan(path, options.training_seeds, options.trust)
     file = plan.file
-    with options.open(path, saved=file) as folder:
+    with options.open(path, saved=file) as folder, Stages(_kept(folder)) as stages:
         run_plan(plan, folder, options)
         read = [read_side(folder / name, name) for name in plan.arms]
         rule, sides = select_rounds(Rule(file.checkpoint, file.at), read)
-        sides = _measure(options, sides, _trials(options, sides, plan.envs, file.eval.n_episodes), folder)
-        study = Study(sides, plan.baseline, rule, file.target)
+        study = Study(_measure(options, sides, plan.envs, file, stages), plan.baseline, rule, file.target)
         _publish(study, folder, f"Study: {path.stem}", file)
 
 
@@ -70,18 +68,22 @@ def _compare(options: CompareOptions, left: Path, right: Path) -> None:
     require_pair(*both)
     rule, both = select_rounds(Rule(options.checkpoint, options.at), both)
     first, *others = [member for side in both for member in side.members]
-    trials: Sequence[Trial] = ()
-    if first.result:
-        _refuse(options, "change nothing for two evaluations; give two policies", "eval", "env", "suite", "seed")
-        Study(both, both[0].name)  # raises unless they can be compared
-        for other in others:
-            warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
-    else:
-        envs = dict.fromkeys((side.name for side in both), _env(options, both))
-        trials = _trials(options, both, envs, options.eval.n_episodes)
-    with options.open() as folder:
-        study = Study(_measure(options, both, trials, folder), both[0].name, rule)
+    folder = options.output_dir
+    with options.lock() as prepare, Stages(_kept(folder), prepare) as stages:
+        if first.result:
+            _refuse(options, "change nothing for two evaluations; give two policies", "eval", "env", "suite", "seed")
+            for other in others:
+                warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
+            study = Study(both, both[0].name, rule)  # raises unless they can be compared
+            stages.started()
+        else:
+            envs = dict.fromkeys((side.name for side in both), _env(options, both))
+            study = Study(_measure(options, both, envs, options, stages), both[0].name, rule)
         _publish(study, folder, f"{left} against {right}", options)
+
+
+def _kept(folder: Path) -> str:
+    return f"every finished episode, in {folder}"
 
 
 def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
@@ -95,26 +97,25 @@ def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
     return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
 
 
-def _trials(
-    options: CompareOptions, sides: Sequence[Side], envs: Mapping[str, EnvConfig], n_episodes: int
-) -> list[Trial]:
-    """Return the test of each side; raises, before any episode runs, if a policy does not fit its environment."""
-    policies = list[Checkpoint]()
-    for side in sides:
-        for path in side.policies:
-            policies.append(Checkpoint.open(path))
-            check_policy(policies[-1], envs[side.name], trust=options.trust)
-    seeds = stream_seeds("test", n_episodes, options.seed)
-    return [Trial.of(envs[side.name], seeds, options.suite, policies, options.trust) for side in sides]
-
-
-def _measure(options: CompareOptions, sides: Sequence[Side], trials: Sequence[Trial], folder: Path) -> tuple[Side, ...]:
-    """Return the sides with their tests; without trials they are evaluations already."""
-    if not trials:
-        return tuple(sides)
-    with Stages(f"every finished episode, in {folder}") as stages, options.open_engine() as engine:
-        pairs = zip(sides, trials, strict=True)
-        return tuple(side.measure(trial, folder, engine, stages) for side, trial in pairs)
+def _measure(
+    options: CompareOptions,
+    sides: Sequence[Side],
+    envs: Mapping[str, EnvConfig],
+    how: ComparisonOptions,
+    stages: Stages,
+) -> tuple[Side, ...]:
+    with options.open_engine() as engine:
+        return measure_sides(
+            sides,
+            envs,
+            options.output_dir,
+            episodes=how.eval.n_episodes,
+            suite=options.suite,
+            seed=options.seed,
+            trust=options.trust,
+            engine=engine,
+            progress=stages,
+        )
 
 
 def _publish(study: Study, folder: Path, title: str, options: Any) -> None:

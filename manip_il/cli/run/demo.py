@@ -17,15 +17,16 @@ from manip_il.cli.demo import DemoOptions
 from manip_il.cli.outputs import REPORT_FILE, about
 from manip_il.cli.progress import Stages, say, say_next
 from manip_il.cli.run.dagger import dagger_config
+from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.eval_report import run_report, success_table
 from manip_il.evaluation.film import collect_films, film_episode, run_states
+from manip_il.evaluation.measuring import evaluate, open_driver
 from manip_il.evaluation.report import Film
-from manip_il.evaluation.runner import Trial
+from manip_il.evaluation.runner import episode_hold
 from manip_il.evaluation.side import Side, read_member
 from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
-from manip_il.seeding import stream_seeds
 
 ENOUGH = 1.25  # demonstrations to record, relative to the number that should give enough labels
 
@@ -73,10 +74,6 @@ def _measure(
     run = Run(replace(config, label_budget=most), folder / f"cloning_{most}", engine, stages)
     more = run.demonstrations(math.ceil(ENOUGH * config.demonstrations * most / first.labels))
     policy = run.fit([more]).path
-    trials = [
-        Trial.of(config.env, stream_seeds("test", count, config.seed), suite)
-        for suite, count in (("nominal", options.test_episodes), ("knocked", options.disturbed_episodes))
-    ]
     contestants = (
         ("expert", None, None, EXPERT),
         ("cloning", first.policy, first.labels, CLONING),
@@ -87,7 +84,17 @@ def _measure(
     for name, path, learnt_from, colour in contestants:
         place = name if learnt_from is None else f"{name}, {learnt_from}"  # a resumed demo may have more labels
         nominal, disturbed = (
-            one.measure(path, name, folder / "evaluations" / one.suite / place, engine, stages) for one in trials
+            evaluate(
+                path,
+                config.env,
+                count,
+                suite=suite,
+                seed=config.seed,
+                output_dir=folder / "evaluations" / suite / place,
+                workers=engine,
+                progress=stages,
+            )
+            for suite, count in (("nominal", options.test_episodes), ("knocked", options.disturbed_episodes))
         )
         sides.append(Side.of(name, nominal, colour=colour, labels=learnt_from, disturbed=disturbed))
     return [path for _, path, *_ in contestants], sides
@@ -100,11 +107,12 @@ def _film(
     cloned, best = sides[1].results[0].episodes, sides[-1].results[0].episodes
     won = {episode.seed for episode in best if episode.success}
     seed = next((one.seed for one in cloned if not one.success and one.seed in won), cloned[0].seed)
-    trial = Trial.of(config.env, range(seed, seed + 1), "nominal")
 
     def films() -> Iterator[Film]:
         for side, policy in zip(sides, policies, strict=True):
-            episode = run_states(trial.job(policy), seed)
+            env, driver, _ = open_driver(policy, config.env)
+            job = RolloutJob(env, driver, episode_hold(env), label="last")
+            episode = run_states(job, seed)
             caption = f"{'success' if episode.success else 'failure'}, seed {seed}"
             yield film_episode(config.env, episode, side.name, caption)
 
