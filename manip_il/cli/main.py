@@ -115,7 +115,7 @@ def _dispatch(own: list[str], others: list[str]) -> None:
     elif name == "--version":
         print(f"{PROGRAM} {__version__}")
     elif own[0] in GROUPS and (not own[1:] or own[1] in HELP):
-        print(_group_help(own[0]))
+        print(_help(own[0]))
     elif {*HELP} & {*words}:
         print(_command_help(name, load(name), words))
     else:
@@ -150,7 +150,11 @@ def _clean(text: str, words: list[str]) -> str:
     return printable(redact(text, words))
 
 
-def _help() -> str:
+def _help(group: str = "") -> str:
+    """Return the help of a group of commands, or of all."""
+    if group:
+        rows = {name: summary for name, (_, summary) in COMMANDS.items() if name.startswith(f"{group} ")}
+        return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_table(rows)}"
     single = {name: summary for name, (_, summary) in COMMANDS.items() if " " not in name}
     groups = {f"{name} ...": summary for name, summary in GROUPS.items()}
     return (
@@ -160,11 +164,6 @@ def _help() -> str:
         f"{PROGRAM} COMMAND --help lists a command's options.\n"
         f"example: {PROGRAM} demo --output_dir=runs/demo"
     )
-
-
-def _group_help(group: str) -> str:
-    rows = {name: summary for name, (_, summary) in COMMANDS.items() if name.startswith(f"{group} ")}
-    return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_table(rows)}"
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:

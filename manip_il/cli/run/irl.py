@@ -5,7 +5,7 @@ from __future__ import annotations
 from manip_il.chapter import inverse
 from manip_il.chapter.rewards.methods import learn
 from manip_il.cli.outputs import publish
-from manip_il.cli.progress import progress, say_next
+from manip_il.cli.progress import progress
 from manip_il.cli.reward import IrlOptions
 from manip_il.seeding import rng_for, stream_base
 
@@ -20,4 +20,3 @@ def run_irl(options: IrlOptions) -> None:
     with options.open() as folder:
         page = inverse.inverse_report(found)
         publish(folder / inverse.FILE_NAME, found.to_json(), [inverse.weight_table(found)], page=page, options=options)
-    say_next("eval", "--policy.type=expert", f"--task.type=carry:{folder / inverse.FILE_NAME}")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from manip_il.bridges.mcap.export import MAPPING, export_dataset, left_out
+from manip_il.bridges.mcap.export import export_dataset, left_out
 from manip_il.bridges.mcap.importing import import_files, list_files
 from manip_il.bridges.mcap.mapping import load_mapping
 from manip_il.cli.outputs import prepare_output, save_options
-from manip_il.cli.progress import progress, say, say_next
+from manip_il.cli.progress import progress, say
 from manip_il.cli.transfer import McapExportOptions, McapImportOptions
 from manip_il.data.atomic import new_folder
 from manip_il.data.dataset import Dataset
@@ -24,7 +24,6 @@ def run_mcap_export(options: McapExportOptions) -> None:
     if missing := left_out(dataset.info):
         say(f"left out, because MCAP cannot hold them: {', '.join(missing)}")
     say(f"exported {dataset.info.episodes:,} episodes to {options.out}")
-    say_next("data", "from-mcap", options.out, "DATASET", f"--mapping={options.out / MAPPING}", what="to convert back")
 
 
 def run_mcap_import(options: McapImportOptions) -> None:

@@ -8,18 +8,13 @@ from manip_il.chapter.preferences.fitting import fit_answers, summary_lines
 from manip_il.chapter.preferences.frames import find_datasets
 from manip_il.chapter.preferences.pairs import Pairs, choose_pairs, join_pairs, read_clips
 from manip_il.chapter.reward import LearnedReward, shape_for, write_reward
-from manip_il.cli.progress import progress, say, say_next
-from manip_il.cli.reward import AnswerOptions, AskOptions, FitOptions, OfPairs, PairsOptions
+from manip_il.cli.progress import progress, say
+from manip_il.cli.reward import AnswerOptions, AskOptions, FitOptions, PairsOptions
 from manip_il.data.atomic import write_file, write_json
 from manip_il.data.dataset import Dataset
 from manip_il.learn.policy_folder import find_policy
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.seeding import rng_for, stream_base
-
-
-def sources_option(options: OfPairs | PairsOptions) -> str:
-    """Return the option that names the sources again, for the next command."""
-    return f"--sources={','.join(map(str, options.sources))}"
 
 
 def run_pairs(options: PairsOptions) -> None:
@@ -30,7 +25,6 @@ def run_pairs(options: PairsOptions) -> None:
     clips = choose_pairs(find_datasets(options.sources), options.clip, options.count, options.seed, rng, reward)
     write_json(options.output, clips.pairs.to_json())
     say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {options.output}")
-    say_next("reward", "ask", options.output, sources_option(options), "--output=ask.html")
 
 
 def run_ask(options: AskOptions) -> None:
@@ -42,7 +36,6 @@ def run_ask(options: AskOptions) -> None:
     page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
     write_file(options.output, page.encode())
     say(f"{len(clips.pairs):,} pairs: {options.output}")
-    say_next("reward", "fit", options.pairs, "preferences.json", sources_option(options), "--output_dir=runs/reward")
 
 
 def run_answer(options: AnswerOptions) -> None:
@@ -53,7 +46,6 @@ def run_answer(options: AnswerOptions) -> None:
     rng = rng_for(stream_base("training", options.seed), "teacher")
     write_json(options.output, answer_pairs(teacher, clips, rng).to_json())
     say(f"{len(clips.pairs):,} answers: {options.output}")
-    say_next("reward", "fit", options.pairs, options.output, sources_option(options), "--output_dir=runs/reward")
 
 
 def run_fit(options: FitOptions) -> None:
@@ -71,5 +63,4 @@ def run_fit(options: FitOptions) -> None:
         target.mkdir(parents=True, exist_ok=True)
         write_reward(target, found.fit.network, found.shape, clips.frames[0].spec, stored, fingerprint)
         write_json(folder / "fit.json", found.to_json())
-    say(*summary_lines(found, answers))
-    say_next("data", "score", "DATASET", f"--reward={folder}", "--output_dir=runs/scores")
+    say(*summary_lines(found, answers), f"reward: {folder}")

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from manip_il import checks
 from manip_il.cli.outputs import OutputFile, about, publish
-from manip_il.cli.progress import progress, say, say_next
+from manip_il.cli.progress import progress, say
 from manip_il.cli.robot import CertifyOptions, RobotCheckOptions, RobotNewOptions
 from manip_il.collect.inputs import env_config
 from manip_il.collect.workers import Engine
@@ -39,7 +39,6 @@ def run_robot_new(options: RobotNewOptions) -> None:
     say(verdict(checked), *(f"change: {line}" for line in advice(checked)))
     if len(checked.failed) == len(NAMES):
         raise ManipError(f"{target} cannot do any task yet; see above")
-    say_next("view", f"--robot.type={target}", "--task.type=pick_place", what="look at the robot")
 
 
 def run_robot_check(options: RobotCheckOptions) -> None:
