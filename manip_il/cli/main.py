@@ -17,6 +17,7 @@ from dataclasses import MISSING
 from typing import Any
 
 from manip_il import __version__
+from manip_il.bridges.store.errors import redact
 from manip_il.cli import progress
 from manip_il.cli.options import Option, metavar, options_of, word
 from manip_il.cli.parsing import check_paths, parse
@@ -145,8 +146,6 @@ def _report(error: BaseException, words: list[str]) -> int:
 
 def _clean(text: str, words: list[str]) -> str:
     """Remove control characters, and tokens, keys and passwords from the command line or a library's errors."""
-    from manip_il.bridges.store.errors import redact
-
     return printable(redact(text, words))
 
 

@@ -11,6 +11,8 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Any, TextIO, override
 
+from tqdm import tqdm
+
 from manip_il.errors import ManipError, UsageError, printable
 from manip_il.progress import Progress
 
@@ -56,8 +58,6 @@ class Warnings(logging.Handler):
 
 
 def _print(line: str, file: TextIO) -> None:
-    from tqdm import tqdm  # imported here because help does not need it
-
     tqdm.write(line, file)  # above a bar, if there is one
     file.flush()
 
@@ -126,8 +126,6 @@ class Stages(Progress):
 
     @override
     def start(self, description: str, total: int | None) -> None:
-        from tqdm import tqdm
-
         self.close()
         self.check()
         how: dict[str, Any] = {"dynamic_ncols": True} if sys.stderr.isatty() else _PLAIN
