@@ -10,7 +10,7 @@ from manip_il.cli.progress import say
 from manip_il.cli.serve import ServeOptions
 from manip_il.data.atomic import exclusive
 from manip_il.data.ownership import output_of, require_ours
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import UsageError
 from manip_il.evaluation.measuring import open_driver
 from manip_il.evaluation.suites import varied
 from manip_il.learn.policy_folder import find_policy
@@ -27,9 +27,7 @@ def run_serve(options: ServeOptions) -> None:
     """Serve until the program ends or the user presses Ctrl-C."""
     leader, policy = options.session.get("leader", LEADERS[0]), None
     if leader not in LEADERS:
-        if not (path := Path(leader).expanduser()).exists():
-            raise UnknownName("leader", leader, (*LEADERS, "the folder of a policy"))
-        policy = find_policy(path)
+        policy = find_policy(Path(leader).expanduser())
     if leader == "sliders" and not has_display():
         raise UsageError("--leader=sliders opens a window, which needs a display; set DISPLAY")
     env, _, seen = open_driver(policy, options.env, trust=options.trust)
