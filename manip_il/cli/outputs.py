@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -114,8 +114,14 @@ def locked(
         prepare_output(kinds, resume=resume, overwrite=how.overwrite, sources=sources)
         save_options(home, options)
 
-    with exclusive(first):
-        yield prepare
+    new = [parent for parent in first.parents if not parent.exists()]
+    try:
+        with exclusive(first):
+            yield prepare
+    finally:
+        for parent in new:
+            with suppress(OSError):
+                parent.rmdir()  # if nothing was written
 
 
 def _inputs(options: Any) -> Iterator[Path]:

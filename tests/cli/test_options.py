@@ -77,7 +77,7 @@ def test_words_change_what_they_name(words, change):
     ("words", "parts"),
     [
         (["--los=l1"], ["unknown option '--los'", "did you mean '--loss'", "manip-il COMMAND --help=all lists all"]),
-        (["--repo-id=x"], ["unknown option '--repo-id' (did you mean '--small.repo_id' or '--dataset.repo_id'?)"]),
+        (["--repo-id=x"], ["unknown option '--repo_id' (did you mean '--small.repo_id' or '--dataset.repo_id'?)"]),
         (["--dataset=x"], ["unknown option '--dataset' (did you mean '--dataset.root'"]),
         (["--lr=fast"], ["--lr", "expected FLOAT", "'fast'"]),
         (["--dataset.num_episodes=1.5"], ["--dataset.num_episodes", "expected INT", "'1.5'"]),
