@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from manip_il import checks
 from manip_il.algorithms.config import check_labels
@@ -54,36 +54,62 @@ def _refuse(options: CompareOptions, why: str, *names: str) -> None:
 
 def _run_study(options: CompareOptions, path: Path) -> None:
     plan = read_plan(path, options.training_seeds, options.trust)
-    file = plan.file
-    with options.open(path, saved=file) as folder, Stages(_kept(folder)) as stages:
+    with options.open(path, saved=plan.file) as folder:
         run_plan(plan, folder, options)
-        read = [read_side(folder / name, name) for name in plan.arms]
-        rule, sides = select_rounds(Rule(file.checkpoint, file.at), read)
-        study = Study(_measure(options, sides, plan.envs, file, stages), plan.baseline, rule, file.target)
-        _publish(study, folder, f"Study: {path.stem}", file)
+        sides = [read_side(folder / name, name) for name in plan.arms]
+        title = f"Study: {path.stem}"
+        _finish(options, plan.file, sides, plan.envs, plan.baseline, title, target=plan.file.target)
 
 
 def _compare(options: CompareOptions, left: Path, right: Path) -> None:
     both = (read_side(left), read_side(right))
     require_pair(*both)
-    rule, both = select_rounds(Rule(options.checkpoint, options.at), both)
     first, *others = [member for side in both for member in side.members]
+    envs = dict[str, EnvConfig]()
+    if first.result:
+        _refuse(options, "change nothing for two evaluations; give two policies", "eval", "env", "suite", "seed")
+        for other in others:
+            warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
+    else:
+        envs = dict.fromkeys((side.name for side in both), _env(options, both))
+    with options.lock() as prepare:
+        _finish(options, options, both, envs, both[0].name, f"{left} against {right}", prepare)
+
+
+def _finish(
+    options: CompareOptions,
+    how: ComparisonOptions,
+    sides: Sequence[Side],
+    envs: Mapping[str, EnvConfig],
+    baseline: str | None,
+    title: str,
+    prepare: Callable[[], None] | None = None,
+    **target: float,
+) -> None:
+    """Run the tests, write the result and the report, print the table and the verdict.
+
+    how: the options to store. envs: of each side; none if the sides are evaluations.
+    """
     folder = options.output_dir
-    with options.lock() as prepare, Stages(_kept(folder), prepare) as stages:
-        if first.result:
-            _refuse(options, "change nothing for two evaluations; give two policies", "eval", "env", "suite", "seed")
-            for other in others:
-                warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
-            study = Study(both, both[0].name, rule)  # raises unless they can be compared
+    rule, sides = select_rounds(Rule(how.checkpoint, how.at), sides)
+    with Stages(f"every finished episode, in {folder}", prepare) as stages, options.open_engine() as engine:
+        if envs:
+            sides = measure_sides(
+                sides,
+                envs,
+                folder,
+                episodes=how.eval.n_episodes,
+                suite=options.suite,
+                seed=options.seed,
+                trust=options.trust,
+                engine=engine,
+                progress=stages,
+            )
+        study = Study(sides, baseline, rule, **target)
+        if not envs:
             stages.started()
-        else:
-            envs = dict.fromkeys((side.name for side in both), _env(options, both))
-            study = Study(_measure(options, both, envs, options, stages), both[0].name, rule)
-        _publish(study, folder, f"{left} against {right}", options)
-
-
-def _kept(folder: Path) -> str:
-    return f"every finished episode, in {folder}"
+    page = compare_report(study, title)
+    publish(folder / FILE_NAME, study.to_json(), [study.table()], study.verdict, *study.facts, page=page, options=how)
 
 
 def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
@@ -95,33 +121,6 @@ def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
         return require_same_env({run.name: replace(run.validation.env(*own), **given) for run in runs})
     origins = {one.name: Checkpoint.open(one.policy).origin for one in members if one.policy is not None}
     return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
-
-
-def _measure(
-    options: CompareOptions,
-    sides: Sequence[Side],
-    envs: Mapping[str, EnvConfig],
-    how: ComparisonOptions,
-    stages: Stages,
-) -> tuple[Side, ...]:
-    with options.open_engine() as engine:
-        return measure_sides(
-            sides,
-            envs,
-            options.output_dir,
-            episodes=how.eval.n_episodes,
-            suite=options.suite,
-            seed=options.seed,
-            trust=options.trust,
-            engine=engine,
-            progress=stages,
-        )
-
-
-def _publish(study: Study, folder: Path, title: str, options: Any) -> None:
-    """Write the result and the report, print the tables and the verdict."""
-    page, tables = compare_report(study, title), [study.table()]
-    publish(folder / FILE_NAME, study.to_json(), tables, study.verdict, *study.facts, page=page, options=options)
 
 
 class StudyPlan(NamedTuple):

@@ -22,10 +22,10 @@ from manip_il.collect.workers import Engine
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.eval_report import run_report, success_table
 from manip_il.evaluation.film import collect_films, film_episode, run_states
-from manip_il.evaluation.measuring import evaluate, open_driver
+from manip_il.evaluation.measuring import measure_sides, open_driver
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.runner import episode_hold
-from manip_il.evaluation.side import Side, read_member
+from manip_il.evaluation.side import Member, Side, read_member
 from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
 
 ENOUGH = 1.25  # demonstrations to record, relative to the number that should give enough labels
@@ -36,8 +36,8 @@ def run_demo(options: DemoOptions) -> None:
     config = dagger_config(DaggerOptions(env=options.env, settings=options.settings, fit=options.fit))
     kept = f"every finished episode, round and evaluation, in {options.output_dir}"
     with options.open() as folder, Stages(kept) as stages, options.open_engine() as engine:
-        policies, sides = _measure(options, config, folder, engine, stages)
-        films, no_films = _film(policies, sides, config, stages)
+        sides = _measure(options, config, folder, engine, stages)
+        films, no_films = _film(sides, config, stages)
     disturbed = [Side.of(side.name, side.disturbed) for side in sides if side.disturbed]
     verdict, *facts = (
         prefix + Comparison(tested[place], tested[-1]).verdict
@@ -60,13 +60,11 @@ def run_demo(options: DemoOptions) -> None:
     success_table(sides).print()
     say(verdict, *facts)
     say(f"report: {folder / REPORT_FILE}")
-    words = f"--policy.path={policies[-1]}", *path_options(vars(config.env)), "--eval.films=3"
+    words = f"--policy.path={sides[-1].members[0].policy}", *path_options(vars(config.env)), "--eval.films=3"
     say_next("eval", *words, f"--output_dir={folder}_eval")
 
 
-def _measure(
-    options: DemoOptions, config: RunConfig, folder: Path, engine: Engine, stages: Stages
-) -> tuple[list[Path | None], list[Side]]:
+def _measure(options: DemoOptions, config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[Side]:
     """Run DAgger, clone from as many labels, and test both, round 0 and the expert (policy None)."""
     results = dagger(folder / "dagger", config, workers=engine, progress=stages)
     first, best = results[0], best_result(results)
@@ -80,41 +78,35 @@ def _measure(
         ("cloning with as many labels", policy, more.labels, CLONING),
         (f"DAgger (round {best.number})", best.policy, best.labels, DAGGER),
     )
-    sides = list[Side]()
-    for name, path, learnt_from, colour in contestants:
-        place = name if learnt_from is None else f"{name}, {learnt_from}"  # a resumed demo may have more labels
-        nominal, disturbed = (
-            evaluate(
-                path,
-                config.env,
-                count,
-                suite=suite,
-                seed=config.seed,
-                output_dir=folder / "evaluations" / suite / place,
-                workers=engine,
-                progress=stages,
-            )
-            for suite, count in (("nominal", options.test_episodes), ("knocked", options.disturbed_episodes))
+    sides = [Side(name, (Member(Path(name), policy=path),), colour, n) for name, path, n, colour in contestants]
+    nominal, disturbed = (
+        measure_sides(
+            sides,
+            {side.name: config.env for side in sides},
+            folder / suite,
+            episodes=count,
+            suite=suite,
+            seed=config.seed,
+            engine=engine,
+            progress=stages,
         )
-        sides.append(Side.of(name, nominal, colour=colour, labels=learnt_from, disturbed=disturbed))
-    return [path for _, path, *_ in contestants], sides
+        for suite, count in (("nominal", options.test_episodes), ("knocked", options.disturbed_episodes))
+    )
+    return [replace(side, disturbed=other.results[0]) for side, other in zip(nominal, disturbed, strict=True)]
 
 
-def _film(
-    policies: Sequence[Path | None], sides: Sequence[Side], config: RunConfig, stages: Stages
-) -> tuple[list[Film], str]:
+def _film(sides: Sequence[Side], config: RunConfig, stages: Stages) -> tuple[list[Film], str]:
     """Film every policy on the first seed on which DAgger succeeds and cloning fails, else on the first seed."""
     cloned, best = sides[1].results[0].episodes, sides[-1].results[0].episodes
     won = {episode.seed for episode in best if episode.success}
     seed = next((one.seed for one in cloned if not one.success and one.seed in won), cloned[0].seed)
 
     def films() -> Iterator[Film]:
-        for side, policy in zip(sides, policies, strict=True):
-            env, driver, _ = open_driver(policy, config.env)
-            job = RolloutJob(env, driver, episode_hold(env), label="last")
-            episode = run_states(job, seed)
+        for side in sides:
+            env, driver, _ = open_driver(side.members[0].policy, config.env)
+            episode = run_states(RolloutJob(env, driver, episode_hold(env)), seed)
             caption = f"{'success' if episode.success else 'failure'}, seed {seed}"
-            yield film_episode(config.env, episode, side.name, caption)
+            yield film_episode(env, episode, side.name, caption)
 
     stages.start("films", len(sides))
     return collect_films(films(), stages)
