@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -108,9 +107,3 @@ class Varied(Pictured):
     """Options of a command that randomises worlds and renders pictures."""
 
     vary: list[str] = option(list, f"what to randomise between episodes: {_CONDITIONS}; or YAML files of ranges")
-
-
-def path_options(env: Mapping[str, Any]) -> list[str]:
-    """Return the options that name files of the user's own, which no dataset, policy or result stores."""
-    named = {"--robot.type": env["robot"], "--task.type": env["task"], "--task.object": env["object"]}
-    return [f"{name}={path}" for name, path in named.items() if isinstance(path, Path)]

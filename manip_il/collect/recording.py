@@ -84,9 +84,10 @@ def record(
         try_encoder(video, job.cameras.size, job.env.control_hz)
     for folder in () if resume else (root, journals):
         require_replaceable(folder)
-    if any(root.glob("*")) and not any(journals.glob("*")):
-        raise UsageError(f"{root} cannot be continued without {journals}; choose another folder")
     progress.started()
+    done = len(list_seeds(journals))
+    if any(root.glob("*")) and not done:
+        raise UsageError(f"{root} cannot be continued without {journals}; choose another folder")
     for line in journal_of(journals, job).prepare():
         _LOG.warning(line)
     recording = Recording(
@@ -94,7 +95,6 @@ def record(
     )
     if policy is None:
         recording = replace(recording, only_successes=True, episodes=episodes)
-    done = len(list_seeds(journals))
     before, now = (one.provenance.get("vary") for one in (Recording.read(journals), recording))
     if done and before != now:
         raise MismatchError("what --vary draws from", str(journals), before, "the command line", now)

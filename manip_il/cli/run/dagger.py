@@ -8,7 +8,6 @@ from pathlib import Path
 from manip_il.algorithms.config import ALGORITHMS, RunConfig
 from manip_il.algorithms.imitation import dagger
 from manip_il.algorithms.results import validation_report
-from manip_il.cli.common_options import path_options
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.options import Open
 from manip_il.cli.outputs import REPORT_FILE, about
@@ -22,7 +21,6 @@ from manip_il.evaluation.suites import varied
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.policy_folder import with_folder
-from manip_il.tasks.config import EnvConfig
 
 
 def run_dagger(options: DaggerOptions) -> None:
@@ -41,14 +39,14 @@ def run_dagger(options: DaggerOptions) -> None:
         replace(page, **about(options)).write(folder / REPORT_FILE)
     if (folder / "dataset").is_dir():
         say(f"labels of all rounds as one dataset: {folder / 'dataset'}")
-    say_best(folder, config.env)
+    say_best(folder)
 
 
-def say_best(folder: Path, env: EnvConfig) -> None:
+def say_best(folder: Path) -> None:
     """Print where a run's report and best policy are, and how to evaluate that."""
     best = folder / "best" / "pretrained_model"
     say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
-    say_next("eval", f"--policy.path={best}", *path_options(vars(env)), f"--output_dir={folder}/test")
+    say_next("eval", f"--policy.path={best}", f"--output_dir={folder}/test")
 
 
 def dagger_config(options: DaggerOptions) -> RunConfig:

@@ -11,7 +11,6 @@ from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.imitation import dagger
 from manip_il.algorithms.results import best_result
 from manip_il.algorithms.run import Run
-from manip_il.cli.common_options import path_options
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.demo import DemoOptions
 from manip_il.cli.outputs import REPORT_FILE, about
@@ -60,8 +59,7 @@ def run_demo(options: DemoOptions) -> None:
     success_table(sides).print()
     say(verdict, *facts)
     say(f"report: {folder / REPORT_FILE}")
-    words = f"--policy.path={sides[-1].members[0].policy}", *path_options(vars(config.env)), "--eval.films=3"
-    say_next("eval", *words, f"--output_dir={folder}_eval")
+    say_next("eval", f"--policy.path={sides[-1].members[0].policy}", "--eval.films=3", f"--output_dir={folder}_eval")
 
 
 def _measure(options: DemoOptions, config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[Side]:

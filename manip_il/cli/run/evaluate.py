@@ -6,7 +6,6 @@ import json
 import tempfile
 from pathlib import Path
 
-from manip_il.cli.common_options import path_options
 from manip_il.cli.evaluate import EvalOptions
 from manip_il.cli.outputs import REPORT_FILE, OutputFile, about, publish
 from manip_il.cli.progress import Stages, say, say_next, warn
@@ -71,7 +70,7 @@ def _evaluate(options: EvalOptions) -> None:
     say(f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
     seed = next((one.seed for one in result.episodes if not one.success), result.episodes[0].seed)
     words = [] if policy.path is None else [f"--policy.path={policy.path}"]
-    say_next("eval", folder, *words, *path_options(options.env), f"--replay={seed}", "--video=replay.mp4")
+    say_next("eval", folder, *words, f"--replay={seed}", "--video=replay.mp4")
 
 
 def _merge(options: EvalOptions) -> None:

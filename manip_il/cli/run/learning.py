@@ -40,7 +40,7 @@ def _run(options: Learning, config: LearningConfig) -> None:
         title = f"{options.method.upper()} on {config.env.robot} {config.env.task}"
         page = validation_report(title, "initial policy", validations(folder), read_lines(folder / METRICS_FILE))
         replace(page, **about(options)).write(folder / REPORT_FILE)
-    say_best(folder, config.env)
+    say_best(folder)
 
 
 def _config(options: Learning, spec: RobotTaskSpec | Origin, **more: Any) -> LearningConfig:

@@ -7,7 +7,7 @@ import os
 
 from manip_il.cli.progress import Stages, say, say_next, set_quiet
 from manip_il.cli.train import RANK, TrainOptions
-from manip_il.collect.inputs import open_dataset, own_files, why_not_simulated
+from manip_il.collect.inputs import open_dataset, why_not_simulated
 from manip_il.learn.training import train
 
 
@@ -42,4 +42,4 @@ def run_train(options: TrainOptions) -> None:
         words = "--policy.discover_packages_path=manip_il.lerobot_plugin", f"--fps={first.spec.fps}"
         say_next("--strategy.type=base", path, *words, what="next, on its robot", program="lerobot-rollout")
     else:
-        say_next("eval", path, *own_files(first.spec), f"--output_dir={folder}/eval")
+        say_next("eval", path, f"--output_dir={folder}/eval")
