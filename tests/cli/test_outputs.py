@@ -151,7 +151,7 @@ def test_a_folder_that_is_in_use_is_refused(how, here, error):
 
 
 def test_a_resumed_run_may_have_more_steps_but_no_fewer(tmp_path):
-    save_options(tmp_path, resumed := TrainOptions(SourceGroup([tmp_path]), fit={"steps": 4}))
+    save_options(tmp_path, resumed := TrainOptions(dataset=SourceGroup([tmp_path]), fit={"steps": 4}))
     check_same_options(tmp_path, replace(resumed, fit={"steps": 8}))
     for other in ({"steps": 2}, {}):
         with pytest.raises(MismatchError, match="--steps"):
