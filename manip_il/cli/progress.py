@@ -96,6 +96,7 @@ class Stages(Progress):
     def __init__(self, kept: str = "", prepare: Callable[[], None] | None = None):
         self.kept = kept
         self._prepare = prepare
+        self._has_output = prepare is None
         self._stopping = False
         self._handlers = dict[int, Any]()
         self._bar: Any = None
@@ -109,7 +110,9 @@ class Stages(Progress):
         self.close()
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
-        if self.kept and isinstance(error, ManipError | KeyboardInterrupt) and not isinstance(error, UsageError):
+        if not self._has_output or not self.kept or isinstance(error, UsageError):
+            return
+        if isinstance(error, ManipError | KeyboardInterrupt):
             prefix = f"{error}; " if error.args else ""
             error.args = (f"{prefix}kept: {self.kept}; continue with --resume=true",)
 
@@ -123,6 +126,7 @@ class Stages(Progress):
     def started(self) -> None:
         if self._prepare is not None:
             self._prepare()
+            self._has_output = True
 
     @override
     def start(self, description: str, total: int | None) -> None:
