@@ -83,7 +83,8 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
 
     Raises `MismatchError` unless the policy can drive `env`, `ManipError` if loading it needs `trust`.
     """
-    path, origin, cameras = str(checkpoint.path), checkpoint.origin, checkpoint.cameras
+    path = str(checkpoint.path)
+    origin, cameras = checkpoint.origin, checkpoint.cameras
     spec = env_spec(env, cameras)
     checkpoint.check_fits(spec)
     checkpoint.require_trust(trust)

@@ -40,7 +40,8 @@ def run_eval(options: EvalOptions) -> None:
 
 
 def _evaluate(options: EvalOptions) -> None:
-    folder, policy, how = options.output_dir, options.policy, options.eval
+    folder = options.output_dir
+    policy, how = options.policy, options.eval
     with (
         options.lock() as prepare,
         Stages(f"finished episodes, in {folder}", prepare) as stages,
