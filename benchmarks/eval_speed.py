@@ -76,7 +76,7 @@ def fitted(robot: str, folder: Path, quick: bool) -> Path:
 
 def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, float]:
     """Return control steps per second on one core, ours and raw, over the same episodes."""
-    job = RolloutJob(make_config(robot, TASK), PolicyDriver((policy,)), label="last")
+    job = RolloutJob(make_config(robot, TASK), PolicyDriver.of(policy), label="last")
     started = time.perf_counter()
     found = list(job.run(stream_seeds("test", episodes)))
     ours = time.perf_counter() - started

@@ -78,7 +78,7 @@ def main() -> int:
             missed |= _print(arm, "true weights", own, own)
             cloned: list[Driven] = []
             if arm == ARMS[0]:
-                job = RolloutJob(_env(arm, truth), PolicyDriver((clone,)), hold=1)
+                job = RolloutJob(_env(arm, truth), PolicyDriver.of(clone), hold=1)
                 cloned = drive(job, truth, layouts, many=True)
                 _print(arm, "cloning", cloned, own)
             for method, reward in rewards.items():

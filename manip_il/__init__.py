@@ -26,13 +26,14 @@ _HOMES = {  # public name -> module, and the name there if it differs
     "Expert": "worlds.ladder.expert:LadderExpert",
     "FitConfig": "learn.fit_config",
     "LearnedPolicy": "learn.policy",
+    "RunConfig": "algorithms.config",
     "State": "mdp",
-    "dagger": "api",
-    "evaluate": "api",
+    "dagger": "algorithms.imitation",
+    "evaluate": "evaluation.measuring",
     "make_config": "worlds.table",
     "make_env": "worlds.ladder.envs",
-    "record": "api",
-    "train": "api",
+    "record": "collect.recording",
+    "train": "learn.training",
 }
 
 

@@ -6,6 +6,7 @@ The command line prints a `ManipError` as one line on standard error and exits w
 from __future__ import annotations
 
 import difflib
+import logging
 import reprlib
 import traceback
 from collections.abc import Iterable
@@ -98,6 +99,4 @@ def shorten(value: object) -> str:
 
 def silence_ffmpeg_warning() -> None:
     """Hide LeRobot's long warning about missing FFmpeg libraries: we read video with PyAV, which has its own."""
-    import logging  # imported here because help does not need it
-
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)

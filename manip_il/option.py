@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import numbers
 import sys
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -38,6 +37,13 @@ def option(default: Any, help_text: str, **metadata: Any) -> Any:
     if callable(default):
         return field(default_factory=default, metadata=metadata)
     return field(default=default, metadata=metadata)
+
+
+def keyword(default: Any, help_text: str, **metadata: Any) -> Any:
+    """Return a field like `option`, which stays a keyword if a class without `kw_only` declares it again."""
+    made = option(Path(default) if isinstance(default, str) else default, help_text, **metadata)
+    made.kw_only = True
+    return made
 
 
 def bounded(default: Any, low: float, high: float) -> Any:
@@ -108,26 +114,6 @@ def make_options[T](cls: type[T], **options: Any) -> T:
         if name not in known:
             raise UnknownName("option", name, known)
     return cls(**options)
-
-
-def takes[**P, R](cls: type, *without: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Return a decorator that shows the fields of `cls` in a function's signature, in place of its `**options`.
-
-    without: fields that the function sets itself.
-    """
-
-    def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        signature = inspect.signature(function)
-        shown = {name: one for name, one in signature.parameters.items() if one.kind is not one.VAR_KEYWORD}
-        for one in fields(cls):
-            if one.name not in (*shown, *without):
-                default = one.default if one.default_factory is MISSING else None
-                kind = inspect.Parameter.KEYWORD_ONLY
-                shown[one.name] = inspect.Parameter(one.name, kind, default=default, annotation=one.type)
-        vars(function)["__signature__"] = signature.replace(parameters=list(shown.values()))
-        return function
-
-    return decorate
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from manip_il.progress import Progress
+
 from .faults.child import run_command
 from .warm import Warm
 
@@ -46,6 +48,14 @@ IMPORTED_ONCE = [
 ]
 forkserver.set_forkserver_preload(IMPORTED_ONCE)
 forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def watching(**methods: Callable[..., object]) -> Progress:
+    """Return a progress with these methods."""
+    progress = Progress()
+    vars(progress).update(methods)
+    return progress
+
 
 LARGE = 1_000_000_000  # of a process [bytes]
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's

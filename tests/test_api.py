@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import ast
-import inspect
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import manip_il
-from manip_il import api
-from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.algorithms import imitation
+from manip_il.algorithms.config import RunConfig
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.sim.conditions import Condition
 
@@ -25,11 +25,6 @@ def test_every_public_name_is_there_and_typed():
     assert [name for name in ast.literal_eval(names) if not getattr(manip_il, name).__doc__] == []
 
 
-def test_an_option_that_is_not_known_is_an_error(tmp_path: Path):
-    with pytest.raises(UnknownName, match="epochs"):
-        manip_il.dagger(tmp_path / "run", manip_il.make_config("panda", "reach"), epochs=3)
-
-
 MISTAKES: dict[str, Callable[[Path], object]] = {
     "unknown option 'stepz' (did you mean 'steps'?)": lambda folder: manip_il.train(SAMPLE, folder, stepz=3),
     "steps is 'many'": lambda folder: manip_il.train(str(SAMPLE), folder, steps="many"),
@@ -39,7 +34,6 @@ MISTAKES: dict[str, Callable[[Path], object]] = {
     "env is 3": lambda folder: manip_il.record(folder / "d", 3, 1),
     "episodes is 'few'": lambda folder: manip_il.record(folder / "d", "panda", "few"),
     "cameras is 'front'": lambda folder: manip_il.record(folder / "d", "panda/reach", 1, cameras="front"),
-    "path is 3": lambda _: manip_il.evaluate(3),
     "is not a LeRobot dataset": lambda folder: manip_il.train(folder, folder / "clone"),
 }
 
@@ -52,22 +46,15 @@ def test_a_mistake_is_one_line_as_on_the_command_line(tmp_path: Path, said: str)
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_options_stand_in_the_signature():
-    assert {"steps", "batch_size", "policy"} <= inspect.signature(manip_il.train).parameters.keys()
-    assert {"rounds", "fit", "label"} <= inspect.signature(manip_il.dagger).parameters.keys()
-    assert {"cameras", "conditions", "hold"} <= inspect.signature(manip_il.record).parameters.keys()
-    assert "driver" not in inspect.signature(manip_il.evaluate).parameters
-
-
 def test_a_folder_holds_the_results_of_one_set_of_options(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(api.Run, "results", lambda run: iter([run.config.rounds]))
+    monkeypatch.setattr(imitation.Run, "results", lambda run: iter([run.config.rounds]))
     env = manip_il.make_config("panda", "reach")
-    assert [manip_il.dagger(tmp_path, env, rounds=rounds) for rounds in (1, 2)] == [[1], [2]]
+    assert [manip_il.dagger(tmp_path, RunConfig(env, rounds=rounds)) for rounds in (1, 2)] == [[1], [2]]
     (tmp_path / "round_000").mkdir()
     with pytest.raises(MismatchError, match="seed differs"):
-        manip_il.dagger(tmp_path, env, rounds=2, seed=7)
+        manip_il.dagger(tmp_path, RunConfig(env, rounds=2, seed=7))
     with pytest.raises(MismatchError, match="fit differs"):
-        manip_il.dagger(tmp_path, env, rounds=2, fit=FitConfig(lr=0.5))
+        manip_il.dagger(tmp_path, RunConfig(env, rounds=2, fit=FitConfig(lr=0.5)))
 
 
 def test_nothing_is_recorded_over_what_is_there(tmp_path: Path):
@@ -76,7 +63,7 @@ def test_nothing_is_recorded_over_what_is_there(tmp_path: Path):
     with pytest.raises(UsageError, match=str(tmp_path)):
         manip_il.record(str(tmp_path), env, 1)
     with pytest.raises(UsageError, match=str(tmp_path)):
-        manip_il.dagger(tmp_path, env)
+        manip_il.dagger(tmp_path, RunConfig(env))
     with pytest.raises(UsageError, match=str(tmp_path)):
         manip_il.train([], tmp_path)
     assert (tmp_path / "metrics.jsonl").read_text() == "mine\n"

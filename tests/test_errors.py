@@ -5,7 +5,7 @@ import pytest
 from manip_il.cli.main import main
 from manip_il.cli.progress import say, warn
 from manip_il.errors import UnknownName, nearest, shorten
-from manip_il.evaluation.tables import Table, print_table
+from manip_il.evaluation.tables import Table
 
 
 def test_a_near_name_is_offered_and_all_are_listed():
@@ -19,7 +19,7 @@ def test_no_control_character_of_a_name_reaches_a_terminal(capsys: pytest.Captur
     name = "\x1b[31mred\x07\x9b\udcff"
     error = UnknownName("body", "hand", [name])
     assert "known: \\x1b[31mred\\x07\\x9b\\udcff" in str(error)
-    for write in (say, warn, lambda line: print_table(Table(("joint",), ((line,),)))):
+    for write in (say, warn, lambda line: Table(("joint",), ((line,),)).print()):
         write(name)
     assert main(["data", name]) == main(["robot", "check", f"{name}.yaml"]) == 2
     assert not {"\x1b", "\x07", "\x9b", "\udcff"} & set("".join(capsys.readouterr()))

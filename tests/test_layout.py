@@ -101,7 +101,7 @@ def test_a_text_becomes_a_path_only_where_a_person_typed_it():
         ("worlds/table.py", "make_config"),
     }
     assert {(file, function) for file, function, _ in calls("make_config")} == {
-        ("api.py", "_env"),  # written in Python
         ("evaluation/robot_check.py", "check_robot"),  # of the robot on the command line
+        ("worlds/table.py", "env_of_name"),  # written in Python
         ("worlds/ladder/envs.py", "make_env"),
     }

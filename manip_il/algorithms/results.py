@@ -1,9 +1,9 @@
-"""Progress and results of a run: callbacks, timing, one result per round or iteration, the best one, and the report."""
+"""Results of a run: timing, one result per round or iteration, the best one, and the report."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,24 +13,13 @@ from manip_il.errors import ManipError
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.eval_report import run_report
 from manip_il.evaluation.report import Report
-from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
+from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import history
 from manip_il.evaluation.side import Member, Side
 from manip_il.evaluation.tables import CLONING, DAGGER
-from manip_il.mdp import Episode
 
 STAGES = ("collect", "fit", "validate")
 VALIDATION = "validation"
-
-
-@dataclass(frozen=True)
-class Watch:
-    """Callbacks for a run's progress. An exception from a callback ends the run; files already written remain."""
-
-    on_stage: Callable[[str, int, int], None] = lambda stage, round_, total: None
-    on_episode: Callable[[Episode | EpisodeResult], None] = lambda episode: None
-    on_log: Callable[[dict[str, Any]], None] = lambda record: None  # {} for a step without metrics
-    on_step: Callable[[], None] = lambda: None  # for any step without another callback
 
 
 class Stopwatch:
@@ -107,25 +96,37 @@ def validations(folder: Path) -> dict[int, EvalResult]:
     return {int(path.parent.name): EvalResult.read(path) for path in sorted(folder.glob(f"{VALIDATION}/*/{FILE_NAME}"))}
 
 
-def best_validation(found: dict[int, EvalResult]) -> int:
+def best_validation(found: Mapping[int, EvalResult]) -> int:
     """Return the iteration with the highest validation success; on a tie the latest."""
     return max(found, key=lambda number: (found[number].success.rate, number))
 
 
-def learning_report(title: str, found: dict[int, EvalResult], records: Sequence[Mapping[str, Any]]) -> Report:
-    """Return the report of a run. found: validations by iteration, at least one. records: lines of metrics.jsonl."""
-    best, names = best_validation(found), {number: f"iteration {number}" for number in found} | {0: "initial policy"}
+def validation_report(
+    title: str, first: str, found: Mapping[int, EvalResult], records: Sequence[Mapping[str, Any]]
+) -> Report:
+    """Return the report of a run.
+
+    Args:
+        title: Of the page.
+        first: Name of the policy with number 0.
+        found: Validations by round or iteration, at least one.
+        records: Lines of `metrics.jsonl`.
+    """
+    best, runs = best_validation(found), history(records, title)
+    labels = {one["round"]: one["labels"] for one in records if "round" in one}
+    names = {number: f"{runs[0].unit} {number}" for number in found} | {0: first}
     sides = {
-        number: Side.of(names[number], result, colour=DAGGER if number else CLONING) for number, result in found.items()
+        number: Side.of(names[number], result, labels=labels.get(number), colour=DAGGER if number else CLONING)
+        for number, result in found.items()
     }
     facts = ["The best policy was chosen on these episodes, which overestimate it; measure it with manip-il eval."]
     if 0 in found and best:
         facts.insert(0, Comparison(sides[0], sides[best]).verdict)
     return run_report(
-        [sides[number] for number in sorted({min(found), best, max(found)})],
-        [Side(title, (Member(Path(title), history=history(records, title)),))],
+        [sides[number] for number in (labels or sorted({min(found), best, max(found)}))],
+        [Side(title, (Member(Path(title), history=runs),))],
         title=title,
-        verdict=f"Best {names[best]}: validation success {found[best].success}.",
+        verdict=f"Best {names[best]}: validation success {found[best].success} of {found[best].success.n:,} episodes.",
         facts=tuple(facts),
         fingerprint=found[best].fingerprint,
     )

@@ -83,7 +83,7 @@ def round_folder(folder: Path, round_: int) -> Path:
 
 def mixture(policy: Fitted, beta: float) -> PolicyDriver:
     """Return a driver: at each step the expert acts with probability beta, else the learner (Ross et al. 2011)."""
-    return PolicyDriver(policy.members, beta, policy.trust)
+    return PolicyDriver.of(*policy.members, beta=beta, trust=policy.trust)
 
 
 def expert_job(config: RunConfig, round_: int) -> RolloutJob:

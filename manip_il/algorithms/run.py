@@ -20,7 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from manip_il.algorithms.results import Result, Stopwatch, Watch, best_result
+from manip_il.algorithms.results import Result, Stopwatch, best_result
 from manip_il.algorithms.rounds import (
     DATASET,
     JOURNALS,
@@ -55,6 +55,7 @@ from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import METRICS_FILE
 from manip_il.evaluation.runner import evaluate
 from manip_il.learn.training_state import PRETRAINED_MODEL
+from manip_il.progress import Progress
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.events import standard_in
@@ -69,10 +70,10 @@ class Run:
     config: a `RunConfig`, or, in the subclass of `manip_il.chapter.learning`, a `LearningConfig`.
     """
 
-    def __init__(self, config: Any, folder: Path, engine: Engine, watch: Watch | None = None):
+    def __init__(self, config: Any, folder: Path, engine: Engine, progress: Progress | None = None):
         self.config, self.folder = config, folder
         self._engine = engine
-        self._watch = watch or Watch()
+        self._progress = progress or Progress()
         self._clock = Stopwatch()
         self._made: dict[int, Rollouts] = {}
         self._held_out_steps = 0
@@ -112,13 +113,13 @@ class Run:
             with self._clock.timed("collect"):
                 self._made[0] = given_rollouts(here, config.datasets)
             return self._made[0]
-        self._watch.on_stage("collect", round_, count)
+        self._progress.start(f"round {round_}, collect", count)
         with self._clock.timed("collect"):
             if not (here / DATASET).is_dir():
                 job = expert_job(config, round_)
                 stream = f"round/{round_}" if round_ else "demonstrations"
                 seeds = stream_seeds(stream, MAX_TRIES * count, config.seed)
-                episodes = collect_successes(self._engine, job, seeds, count, here / JOURNALS, self._watch.on_episode)
+                episodes = collect_successes(self._engine, job, seeds, count, here / JOURNALS, self._progress.episode)
                 recording = Recording(True, count, provenance(job), labels=self._budget(round_))
                 record_round(here, job, episodes, recording)
             self._made[round_] = read_rollouts(here, round_, beta=1.0, queried_everywhere=True)
@@ -147,7 +148,7 @@ class Run:
         config = self.config
         rule = query or Query()
         count = config.episodes_per_round
-        self._watch.on_stage("collect", round_, count)
+        self._progress.start(f"round {round_}, collect", count)
         with self._clock.timed("collect"):
             if not (here / DATASET).is_dir():
                 steps = config.steps_of_branch if config.label == "branch" else 1
@@ -156,8 +157,8 @@ class Run:
                 seeds, first = stream_seeds(f"round/{round_}", count, config.seed), round(disturbed * count)
                 hard = replace(job, conditions=(standard_in(job.conditions),))
                 episodes = itertools.chain(
-                    collect(self._engine, hard, seeds[:first], here / JOURNALS, self._watch.on_episode),
-                    collect(self._engine, job, seeds[first:], here / JOURNALS, self._watch.on_episode),
+                    collect(self._engine, hard, seeds[:first], here / JOURNALS, self._progress.episode),
+                    collect(self._engine, job, seeds[first:], here / JOURNALS, self._progress.episode),
                 )
                 left = self._budget(round_)
                 recording = Recording(provenance=provenance(job), only_labelled=not job.labels_all, labels=left)
@@ -180,17 +181,17 @@ class Run:
             for member, start in enumerate(starts):
                 name = "fit" if config.ensemble == 1 else f"fit {member + 1} of {config.ensemble}"
                 fit = round_fit(config, start, member)
-                self._watch.on_stage(name, round_, fit.total_steps)
+                self._progress.start(f"round {round_}, {name}", fit.total_steps)
                 with self._clock.timed("fit"):
-                    members.append(fit_round(roots, here, fit, member, self._watch.on_log))
+                    members.append(fit_round(roots, here, fit, member, self._progress.log))
         self._fitted = Fitted(round_, tuple(members), config.fit.trust)
         return self._fitted
 
     def validate(self, policy: Fitted) -> Result:
         """Evaluate a round's policy on the validation seeds; return the round's result."""
         round_, config = policy.round, self.config
-        self._watch.on_stage("validate", round_, config.validation_episodes)
-        driver = PolicyDriver((policy.path,), trust=config.fit.trust)
+        self._progress.start(f"round {round_}, validate", config.validation_episodes)
+        driver = PolicyDriver.of(policy.path, trust=config.fit.trust)
         job = RolloutJob(config.env, driver, config.hold, label="last", conditions=config.conditions)
         validation = self._evaluate(job, self._folder(round_) / FILE_NAME, f"DAgger round {round_}")
         here, so_far = self._made[round_], [one for one in self._made.values() if one.round <= round_]
@@ -218,7 +219,7 @@ class Run:
                 return EvalResult.read(path)
             suite = job.conditions[0].name if job.conditions else NOMINAL.name
             seeds = stream_seeds("validation", self.config.validation_episodes, self.config.seed)
-            found = evaluate(self._engine, job, seeds, name, self._watch.on_episode, suite=suite)
+            found = evaluate(self._engine, job, seeds, name, self._progress.episode, suite=suite)
             found.write(path)
             return found
 
@@ -245,9 +246,9 @@ class Run:
         if not root.is_dir():
             made = [one.dataset for one in self._made.values() if one.dataset and one.round <= rollouts.round]
             scenes = round_scenes(self.config, made)
-            self._watch.on_stage("redraw", rollouts.round, len(scenes.numbers[::CHUNK]))
+            self._progress.start(f"round {rollouts.round}, redraw", len(scenes.numbers[::CHUNK]))
             workers = min(self._engine.workers or default_workers(), default_workers())
             with self._clock.timed("redraw"):
-                target = EditTarget(root, workers, on_piece=self._watch.on_step)
+                target = EditTarget(root, workers, on_piece=self._progress.step)
                 redraw_dataset(EditSource(Dataset.open(dataset), self.config.env), scenes, target)
         return root

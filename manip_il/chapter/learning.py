@@ -30,13 +30,12 @@ from manip_il.chapter.episodes import ActionRange, Lockstep, RobotEpisode, Trans
 from manip_il.chapter.ppo import Learner, save_policy, seed_generators, start_conversion, start_policy
 from manip_il.chapter.reward import LearnedReward
 from manip_il.collect.drivers import PolicyDriver
-from manip_il.collect.job import RolloutJob
+from manip_il.collect.job import HOLD, RolloutJob
 from manip_il.data.atomic import new_folder
 from manip_il.data.dataset import Dataset
 from manip_il.data.ownership import CHECKPOINT, kind_of
 from manip_il.errors import UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
 from manip_il.learn.network import threads
 from manip_il.learn.training_state import (
@@ -136,7 +135,7 @@ class LearningRun(Run):
         for other in folder.iterdir():
             if not other.is_symlink() and other != made and kind_of(other) == CHECKPOINT:
                 shutil.rmtree(other, ignore_errors=True)
-        self._watch.on_step()
+        self._progress.step()
         return self._result(agent, folder / "last" / PRETRAINED_MODEL)
 
     def _result(self, agent: Agent, policy: Path) -> Result:
@@ -163,7 +162,7 @@ class LearningRun(Run):
         if not here.is_dir():
             with new_folder(here) as new:
                 shutil.copytree(policy, new / PRETRAINED_MODEL)
-        job = RolloutJob(self.config.env, PolicyDriver((here / PRETRAINED_MODEL,)), HOLD, label="last")
+        job = RolloutJob(self.config.env, PolicyDriver.of(here / PRETRAINED_MODEL), HOLD, label="last")
         found = self._evaluate(job, here / FILE_NAME, f"iteration {number}")
         if number == best_validation(validations(self.folder)):
             self._keep_best(policy)

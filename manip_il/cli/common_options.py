@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il.cli.options import Given, given
-from manip_il.option import option
+from manip_il.option import keyword, option
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.worlds.config import WORLDS, EnvConfig
 from manip_il.worlds.table import env_spec
@@ -43,18 +43,22 @@ class OfDataset:
     dataset: Path = option(MISSING, DATASET, exists="datasets/", positional=True)
 
 
-@dataclass(frozen=True)
+def worker_count(default: int | None = None) -> Any:
+    """Return the field of a number of workers."""
+    about = "number of processes, or of concurrent tasks on Ray; none (null): one per core"
+    return keyword(default, about, at_least=1, free=True)
+
+
+@dataclass(frozen=True, kw_only=True)
 class EngineOptions:
     """Options of worker processes on this machine or a Ray cluster."""
 
-    workers: int | None = option(
-        None, "number of processes, or of concurrent tasks on Ray; none (null): one per core", at_least=1, free=True
-    )
+    workers: int | None = worker_count()
     engine: Literal["local", "ray"] = option(
         "local", "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, else on this machine)", free=True
     )
 
-    def open(self) -> Engine:
+    def open_engine(self) -> Engine:
         """Return the engine, to use as a context manager."""
         from manip_il.collect.workers import Engine
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting
-from manip_il.cli.options import Given, Open, given, group
-from manip_il.cli.outputs import ResumableOutput
+from manip_il.cli.options import Given, Open, given
+from manip_il.cli.outputs import ResumableOutput, output_folder
 from manip_il.option import Seeded, option
 from manip_il.seeding import MAX_SEED
 from manip_il.worlds.config import EnvConfig
@@ -53,7 +53,7 @@ class StudyFile(ComparisonOptions):
 
 
 @dataclass(frozen=True)
-class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
+class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
     """Compare two policies, runs, or folders of several training seeds on the same test seeds; or run a whole study.
 
     Each side is an eval.json, a policy, a run of manip-il dagger, or a folder with one of these per training seed
@@ -63,9 +63,10 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
     One YAML file instead of two sides is a study: every arm (a set of options) is trained with several seeds, tested
     on the same unseen seeds, and compared. The file holds `common` and `arms` (options of manip-il dagger),
     training_seeds, eval, checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs.
+
+    Example: manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare
     """
 
-    example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"
     first: ClassVar[str] = "at eval.n_episodes suite output_dir resume training_seeds"
     sides: list[Path] = option(
         MISSING,
@@ -78,5 +79,4 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting):
     training_seeds: int | None = option(
         None, "training seeds of a study, if not its file's; may grow with --resume=true", at_least=1, free=True
     )
-    engine: EngineOptions = group(EngineOptions(), prefix="")
-    output: ResumableOutput = group(ResumableOutput(Path("runs/compare")), prefix="")
+    output_dir: Path = output_folder("runs/compare")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
 from manip_il.algorithms.config import Method, RunConfig
 from manip_il.cli.common_options import SMALL, DatasetRoots, EngineOptions, Trusting, Varied
-from manip_il.cli.options import Given, given, group
-from manip_il.cli.outputs import ResumableOutput
+from manip_il.cli.options import Given, given
+from manip_il.cli.outputs import ResumableOutput, output_folder
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
 from manip_il.sim.config import CameraConfig
@@ -19,16 +19,17 @@ _OF_FIT = ("policy", "action_space", "observation", "steps", "batch_size", "lr",
 
 
 @dataclass(frozen=True)
-class DaggerOptions(Varied, Trusting):
+class DaggerOptions(Varied, Trusting, EngineOptions, ResumableOutput):
     """Roll out the policy, query the expert in every visited state, aggregate, refit, and repeat.
 
     Round 0 is behaviour cloning on new demonstrations of the expert, or on those in --dataset.root. With --policy.path
     round 0 is that policy, and only the demonstrations in --dataset.root are used. --policy.type is mlp, cnn or any
     LeRobot policy, with the options of `manip-il train`. OUTPUT_DIR/best holds the round with the highest validation
     success.
+
+    Example: manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger
     """
 
-    example: ClassVar[str] = "manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger"
     first: ClassVar[str] = "robot.type task.type demonstrations rounds episodes_per_round policy output_dir resume"
     env: Given = given(EnvConfig)
     method: Method = option(
@@ -36,7 +37,7 @@ class DaggerOptions(Varied, Trusting):
         "who drives after round 0: the learner (dagger), the expert (cloning), or the expert with noise like the "
         "learner's errors (dart)",
     )
-    dataset: DatasetRoots = group(DatasetRoots([]))
+    dataset: DatasetRoots = field(default_factory=lambda: DatasetRoots([]))
     settings: Given = given(RunConfig, prefix="")
     query: str | None = option(
         None,
@@ -45,5 +46,4 @@ class DaggerOptions(Varied, Trusting):
     )
     fit: Given = given(FitConfig, prefix="", only=_OF_FIT, fixed=("steps",))
     image: Given = given(CameraConfig, **SMALL)
-    engine: EngineOptions = group(EngineOptions(), prefix="")
-    output: ResumableOutput = group(ResumableOutput(Path("runs/dagger")), prefix="")
+    output_dir: Path = output_folder("runs/dagger")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import ClassVar
 
 from manip_il.checks import parse_yaml, shorten
 from manip_il.cli.common_options import SMALL, Pictured, Varied
@@ -23,9 +22,10 @@ class BuildOptions(Replacing):
     """Build a LeRobot dataset from a folder of journals.
 
     The dataset has the same bytes as the one that manip-il record writes with these journals.
+
+    Example: manip-il data build datasets/demos.journals datasets/demos
     """
 
-    example: ClassVar[str] = "manip-il data build datasets/demos.journals datasets/demos"
     journals: Path = option(MISSING, "folder of episode-*.mcap files", positional=True, exists="")
     dataset: Path = option(MISSING, "folder of the new dataset", positional=True)
 
@@ -48,9 +48,10 @@ class MergeOptions(Replacing):
 
     Every column, every frame's text and all films are copied. Robot, rate, columns and codecs must agree, and the task
     if manip-il recorded it. The provenance of datasets of manip-il names the sources.
+
+    Example: manip-il data merge datasets/demos datasets/more --output=datasets/both
     """
 
-    example: ClassVar[str] = "manip-il data merge datasets/demos datasets/more --output=datasets/both"
     datasets: list[Path] = option(MISSING, "LeRobot v3.0 datasets", exists="datasets/", positional=True)
     output: Path = option(MISSING, "folder of the new dataset")
     episodes: list[str] = option(
@@ -83,9 +84,11 @@ class Edit(Replacing):
 
 @dataclass(frozen=True)
 class RenderOptions(Edit, Pictured):
-    """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights. No simulation runs."""
+    """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights. No simulation runs.
 
-    example: ClassVar[str] = "manip-il data render datasets/demos datasets/dim --cameras=front --look.brightness=0.6"
+    Example: manip-il data render datasets/demos datasets/dim --cameras=front --look.brightness=0.6
+    """
+
     look: Look = field(default_factory=Look)
 
 
@@ -96,9 +99,9 @@ class RelabelOptions(Edit):
     TARGET is SOURCE with new labels; executed actions, pictures and all other columns stay the same. States in which
     the expert was not queried get a label, too. Prints how many labels changed: by more than 1 % of a joint's longest
     step, in phase, or in validity.
-    """
 
-    example: ClassVar[str] = "manip-il data relabel datasets/demos"
+    Example: manip-il data relabel datasets/demos
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,9 +111,10 @@ class RedrawOptions(Edit, Varied, Seeded):
     TARGET is a LeRobot dataset for training policies on pictures; each scene is one episode. Scenes without a valid
     label are left out. --vary takes view, clutter, object (its colour), sensing (its noise), or YAML files of
     ranges.
+
+    Example: manip-il data redraw runs/dagger datasets/redrawn --frames=20000
     """
 
-    example: ClassVar[str] = "manip-il data redraw runs/dagger datasets/redrawn --frames=20000"
     frames: int = option(20_000, "number of scenes to draw", at_least=1)
     pictures: bool = option(True, "render the scenes; false: write states only, for --policy.states")
     scenes: bool = option(True, "draw new goals and objects; false: keep the visited states")

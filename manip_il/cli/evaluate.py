@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting
-from manip_il.cli.options import Given, given, group
-from manip_il.cli.outputs import ResumableOutput
+from manip_il.cli.options import Given, given
+from manip_il.cli.outputs import ResumableOutput, output_folder
 from manip_il.option import Seeded, option
 from manip_il.worlds.config import EnvConfig
 
@@ -41,15 +41,16 @@ class EvalGroup:
 
 
 @dataclass(frozen=True)
-class EvalOptions(Tested, Seeded, Trusting):
+class EvalOptions(Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
     """Measure a policy's success on unseen seeds; writes eval.json and report.html.
 
     With EVALUATION, an eval.json or its folder, no policy is evaluated: --replay=SEED runs one of its episodes again
     and films it; two or more, such as parts run on several machines, are merged. --check renders a picture and reports
     whether this machine or container can evaluate.
+
+    Example: manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert
     """
 
-    example: ClassVar[str] = "manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert"
     first: ClassVar[str] = "policy.path policy.type eval.n_episodes suite robot.type task.type output_dir replay resume"
     evaluation: list[Path] = option(
         list, "evaluations: one with --replay, or several to merge", positional=True, exists=""
@@ -60,8 +61,7 @@ class EvalOptions(Tested, Seeded, Trusting):
     until_width: float | None = option(
         None, "stop when the confidence interval is this narrow; 0.02: 2 percentage points", at_least=0.0001, at_most=1
     )
-    engine: EngineOptions = group(EngineOptions(), prefix="")
-    output: ResumableOutput = group(ResumableOutput(Path("runs/eval")), prefix="")
+    output_dir: Path = output_folder("runs/eval")
     replay: int | None = option(None, "seed of the episode of EVALUATION to replay", at_least=0, free=True)
     video: Path | None = option(None, "MP4 file for the replay", free=True)
     health: bool = option(False, "check that this machine can evaluate and render", flag="check", free=True)

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import logging
 import os
 import re
-import select
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING
-from typing import Any, NamedTuple
+from typing import Any
 
 from manip_il import __version__
+from manip_il.bridges.store.errors import redact
 from manip_il.cli import progress
 from manip_il.cli.options import Option, metavar, options_of, word
 from manip_il.cli.parsing import check_paths, parse
@@ -26,51 +27,42 @@ PROGRAM = "manip-il"
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 
 
-class Command(NamedTuple):
-    """A command.
-
-    target: `module:OptionsClass` in `manip_il.cli`; its function is in the module of `manip_il.cli.run` with the
-    same name or, so that it imports only what it needs, in the one that a third part names.
-    """
-
-    target: str
-    summary: str
-
-
+# name -> `module:OptionsClass` in `manip_il.cli`, and a summary. The function is in the module of `manip_il.cli.run`
+# with the same name or, so that it imports only what it needs, in the one that a third part names.
 COMMANDS = {
-    "demo": Command("demo:DemoOptions", "run a small complete example: record, clone, DAgger, report"),
-    "record": Command("record:RecordOptions", "record demonstrations of the expert as a dataset"),
-    "train": Command("train:TrainOptions", "train a policy on a dataset (behaviour cloning)"),
-    "dagger": Command("dagger:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),
-    "eval": Command("evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
-    "compare": Command("compare:CompareOptions", "compare policies, runs or whole studies on the same seeds"),
-    "view": Command("view:ViewOptions", "watch a robot at its task, in a window or a browser"),
-    "serve": Command("serve:ServeOptions", "run a virtual SO-101 for LeRobot's own programs"),
-    "push": Command("transfer:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
-    "pull": Command("transfer:PullOptions", "download a dataset or policy and verify every file"),
-    "export": Command("transfer:ExportOptions:export", "export a policy as ONNX"),
-    "theory": Command("theory:TheoryOptions", "compare the proven bounds of cloning and DAgger with a run"),
-    "data check": Command("data_check:CheckOptions", "find errors in any LeRobot dataset"),
-    "data repair": Command("data_check:RepairOptions", "repair a dataset, from its journals or its own data"),
-    "data render": Command("data_edits:RenderOptions", "render a dataset again, with other cameras, sizes or lights"),
-    "data redraw": Command("data_edits:RedrawOptions", "randomise and render visited states for policies with cameras"),
-    "data relabel": Command("data_edits:RelabelOptions", "relabel a dataset with the current expert"),
-    "data build": Command("data_edits:BuildOptions", "rebuild a dataset from its journals"),
-    "data merge": Command("data_edits:MergeOptions", "merge datasets of one robot and task"),
-    "data score": Command("data_check:ScoreOptions:score", "score a dataset's episodes by a reward, to find bad ones"),
-    "data to-mcap": Command("transfer:McapExportOptions:mcap", "convert a dataset to MCAP files, for Foxglove etc."),
-    "data from-mcap": Command("transfer:McapImportOptions:mcap", "convert MCAP files to a dataset with a mapping file"),
-    "robot new": Command("robot:RobotNewOptions", "write a first YAML file for an arm's MJCF"),
-    "robot check": Command("robot:RobotCheckOptions", "measure what an arm can do, before recording"),
-    "robot certify": Command("robot:CertifyOptions", "measure from which states the expert recovers"),
-    "rl gail": Command("learning:GailOptions", "imitate by GAIL: reinforcement learning from demonstrations"),
-    "rl airl": Command("learning:AirlOptions", "imitate by AIRL, which also learns a reward"),
-    "rl ppo": Command("learning:PpoOptions", "improve a cloned policy with a reward learnt from preferences"),
-    "reward irl": Command("reward:IrlOptions:irl", "learn a reward from demonstrations of the task carry"),
-    "reward pairs": Command("reward:PairsOptions", "choose pairs of clips to compare"),
-    "reward ask": Command("reward:AskOptions", "make a page that asks which clip is better"),
-    "reward answer": Command("reward:AnswerOptions", "let a simulated teacher answer pairs by true progress"),
-    "reward fit": Command("reward:FitOptions", "learn a reward from answers"),
+    "demo": ("demo:DemoOptions", "run a small complete example: record, clone, DAgger, report"),
+    "record": ("record:RecordOptions", "record demonstrations of the expert as a dataset"),
+    "train": ("train:TrainOptions", "train a policy on a dataset (behaviour cloning)"),
+    "dagger": ("dagger:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),
+    "eval": ("evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
+    "compare": ("compare:CompareOptions", "compare policies, runs or whole studies on the same seeds"),
+    "view": ("view:ViewOptions", "watch a robot at its task, in a window or a browser"),
+    "serve": ("serve:ServeOptions", "run a virtual SO-101 for LeRobot's own programs"),
+    "push": ("transfer:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
+    "pull": ("transfer:PullOptions", "download a dataset or policy and verify every file"),
+    "export": ("transfer:ExportOptions:export", "export a policy as ONNX"),
+    "theory": ("theory:TheoryOptions", "compare the proven bounds of cloning and DAgger with a run"),
+    "data check": ("data_check:CheckOptions", "find errors in any LeRobot dataset"),
+    "data repair": ("data_check:RepairOptions", "repair a dataset, from its journals or its own data"),
+    "data render": ("data_edits:RenderOptions", "render a dataset again, with other cameras, sizes or lights"),
+    "data redraw": ("data_edits:RedrawOptions", "randomise and render visited states for policies with cameras"),
+    "data relabel": ("data_edits:RelabelOptions", "relabel a dataset with the current expert"),
+    "data build": ("data_edits:BuildOptions", "rebuild a dataset from its journals"),
+    "data merge": ("data_edits:MergeOptions", "merge datasets of one robot and task"),
+    "data score": ("data_check:ScoreOptions:score", "score a dataset's episodes by a reward, to find bad ones"),
+    "data to-mcap": ("transfer:McapExportOptions:mcap", "convert a dataset to MCAP files, for Foxglove etc."),
+    "data from-mcap": ("transfer:McapImportOptions:mcap", "convert MCAP files to a dataset with a mapping file"),
+    "robot new": ("robot:RobotNewOptions", "write a first YAML file for an arm's MJCF"),
+    "robot check": ("robot:RobotCheckOptions", "measure what an arm can do, before recording"),
+    "robot certify": ("robot:CertifyOptions", "measure from which states the expert recovers"),
+    "rl gail": ("learning:GailOptions", "imitate by GAIL: reinforcement learning from demonstrations"),
+    "rl airl": ("learning:AirlOptions", "imitate by AIRL, which also learns a reward"),
+    "rl ppo": ("learning:PpoOptions", "improve a cloned policy with a reward learnt from preferences"),
+    "reward irl": ("reward:IrlOptions:irl", "learn a reward from demonstrations of the task carry"),
+    "reward pairs": ("reward:PairsOptions", "choose pairs of clips to compare"),
+    "reward ask": ("reward:AskOptions", "make a page that asks which clip is better"),
+    "reward answer": ("reward:AnswerOptions", "let a simulated teacher answer pairs by true progress"),
+    "reward fit": ("reward:FitOptions", "learn a reward from answers"),
 }
 GROUPS = {
     "data": "check, repair, edit, score and convert datasets",
@@ -90,6 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     end = given.index("--") if "--" in given else len(given)  # the words after `--` are another program's
     own = [word for word in given[:end] if word not in ("--debug", "--quiet")]
     progress.set_quiet("--quiet" in given[:end])
+    logging.getLogger("manip_il").handlers = [progress.Warnings()]
     try:
         _dispatch(own, given[end:])
     except (Exception, KeyboardInterrupt) as error:
@@ -103,13 +96,13 @@ def load(name: str) -> type:
     """Return the dataclass of a command's options; `UnknownName` lists the known commands."""
     if name not in COMMANDS:
         raise UnknownName("command", name, COMMANDS)
-    module, options_class, *_ = COMMANDS[name].target.split(":")
+    module, options_class, *_ = COMMANDS[name][0].split(":")
     return getattr(importlib.import_module(f"manip_il.cli.{module}"), options_class)
 
 
 def run(name: str, options: Any) -> None:
     """Run a command with its options."""
-    module, options_class, *other = COMMANDS[name].target.split(":")
+    module, options_class, *other = COMMANDS[name][0].split(":")
     work = importlib.import_module(f"manip_il.cli.run.{[*other, module][0]}")
     command = re.sub(r"\B(?=[A-Z])", "_", options_class.removesuffix("Options")).lower()
     getattr(work, f"run_{command}")(options)
@@ -123,7 +116,7 @@ def _dispatch(own: list[str], others: list[str]) -> None:
     elif name == "--version":
         print(f"{PROGRAM} {__version__}")
     elif own[0] in GROUPS and (not own[1:] or own[1] in HELP):
-        print(_group_help(own[0]))
+        print(_help(own[0]))
     elif {*HELP} & {*words}:
         print(_command_help(name, load(name), words))
     else:
@@ -136,7 +129,8 @@ def _dispatch(own: list[str], others: list[str]) -> None:
 def _report(error: BaseException, words: list[str]) -> int:
     """Print an error as one line on standard error; return the exit code."""
     code = 1
-    if isinstance(error, BrokenPipeError) and _is_reader_gone():
+    if isinstance(error, BrokenPipeError):  # the reader of standard output, such as `head`, has ended
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return code
     if isinstance(error, KeyboardInterrupt):
         text, code = f"interrupted{f'; {error}' if error.args else ''}", EXIT_INTERRUPTED
@@ -150,24 +144,17 @@ def _report(error: BaseException, words: list[str]) -> int:
     return code
 
 
-def _is_reader_gone() -> bool:
-    """Return whether the reader of standard output, such as `head`, has ended; if so, discard further output."""
-    pipe = select.poll()
-    pipe.register(sys.stdout.fileno(), 0)
-    if gone := any(event & select.POLLERR for _, event in pipe.poll(0)):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return gone
-
-
 def _clean(text: str, words: list[str]) -> str:
     """Remove control characters, and tokens, keys and passwords from the command line or a library's errors."""
-    from manip_il.bridges.store.errors import redact
-
     return printable(redact(text, words))
 
 
-def _help() -> str:
-    single = {name: command.summary for name, command in COMMANDS.items() if " " not in name}
+def _help(group: str = "") -> str:
+    """Return the help of a group of commands, or of all."""
+    if group:
+        rows = {name: summary for name, (_, summary) in COMMANDS.items() if name.startswith(f"{group} ")}
+        return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_table(rows)}"
+    single = {name: summary for name, (_, summary) in COMMANDS.items() if " " not in name}
     groups = {f"{name} ...": summary for name, summary in GROUPS.items()}
     return (
         f"usage: {PROGRAM} COMMAND [--option=value ...]\n\n"
@@ -176,11 +163,6 @@ def _help() -> str:
         f"{PROGRAM} COMMAND --help lists a command's options.\n"
         f"example: {PROGRAM} demo --output_dir=runs/demo"
     )
-
-
-def _group_help(group: str) -> str:
-    rows = {name: command.summary for name, command in COMMANDS.items() if name.startswith(f"{group} ")}
-    return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_table(rows)}"
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
@@ -204,9 +186,10 @@ def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
 
         lines = _table({left: f"[{right}]" for left, right in option_lines(kind)})
         more = f"\n\noptions of {kind}:\n{lines}"
+    text, _, example = str(inspect.getdoc(cls)).partition("Example: ")
     return (
-        f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{inspect.getdoc(cls)}\n\n"
-        f"options:\n{_table(rows)}{more}\n\n{_GLOBAL_HELP}\n\nexample: {cls.example}"
+        f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{text.strip()}\n\n"
+        f"options:\n{_table(rows)}{more}\n\n{_GLOBAL_HELP}\n\nexample: {' '.join(example.split())}"
     )
 
 

@@ -37,12 +37,6 @@ _METAVARS: dict[Any, str] = {
 }
 
 
-def group(default: Any, prefix: str | None = None) -> Any:
-    """Return a field of nested options. prefix: how their names begin, by default the field's name and a dot."""
-    metadata = {} if prefix is None else {"prefix": prefix}
-    return field(default_factory=functools.partial(dataclasses.replace, default), metadata=metadata)
-
-
 def given(
     cls: type, prefix: str | None = None, only: Collection[str] = (), fixed: Collection[str] = (), **own: Any
 ) -> Any:
@@ -63,7 +57,8 @@ class Option:
     path: attributes and keys that lead from the command's options to its value. metadata: `help`, one line;
     `positional` for a value without a name; `command_line_only` for an option that no file may set; `exists` for a path
     that must exist, with its prefix on the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`; `free`
-    and `grows` for an option that a resumed run may change (see `check_same_options`).
+    and `grows` for an option that a resumed run may change (see `check_same_options`). is_given: whether
+    it is an option of another class, see `given`.
     """
 
     name: str  # dotted: `dataset.root`
@@ -71,6 +66,7 @@ class Option:
     type: Any
     default: Any
     metadata: Mapping[str, Any]
+    is_given: bool = False
 
     @property
     def positional(self) -> bool:
@@ -114,7 +110,7 @@ def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, .
                     own, about = default.get(theirs.name, default_of(theirs)), dict(theirs.metadata)
                     if theirs.name in one.metadata["fixed"]:
                         about["grows"] = False
-                    found.append(Option(name, (*here, theirs.name), type_of(source, theirs), own, about))
+                    found.append(Option(name, (*here, theirs.name), type_of(source, theirs), own, about, is_given=True))
         elif dataclasses.is_dataclass(kind):
             found += options_of(typing.cast(type, kind), None if default is MISSING else default, inner, here)
         else:
@@ -176,12 +172,13 @@ def metavar(option_type: Any) -> str:
 
 def from_word(option_type: Any, word: str) -> Any:
     """Return the value of a command-line word: None for `null`, texts for a list type, else the word itself."""
-    if (some := without_none(option_type)) != option_type:
-        return None if word.lower() in ("null", "none") else from_word(some, word)
-    if typing.get_origin(option_type) is not list:
+    some = without_none(option_type)
+    if some != option_type and word in ("null", "none"):
+        return None
+    if typing.get_origin(some) is not list:
         return word
-    inner = word[1:-1] if word.startswith("[") and word.endswith("]") else word
-    return [item.strip().strip("'\"") for item in inner.split(",")] if inner.strip() else []
+    inner = word.removeprefix("[").removesuffix("]")
+    return [item.strip(" '\"") for item in inner.split(",")] if inner else []
 
 
 def decode(option_type: Any, value: Any) -> Any:

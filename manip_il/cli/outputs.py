@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,16 +12,9 @@ from manip_il.cli.options import command_line, options_of, to_plain
 from manip_il.cli.parsing import dump_yaml, from_yaml
 from manip_il.cli.progress import say
 from manip_il.data.atomic import clear, exclusive, write_file, write_json
-from manip_il.data.ownership import (
-    CONFIG_FILE,
-    PARTIAL,
-    is_our_file,
-    kind_of,
-    output_of,
-    require_replaceable,
-)
+from manip_il.data.ownership import CONFIG_FILE, PARTIAL, is_our_file, kind_of, output_of, require_replaceable
 from manip_il.errors import MismatchError, UsageError
-from manip_il.option import option
+from manip_il.option import keyword, option
 
 if TYPE_CHECKING:
     from manip_il.evaluation.report import Report
@@ -44,59 +37,50 @@ class Resumable(Replacing):
     resume: bool = option(False, "continue an interrupted run", free=True)
 
 
-@dataclass(frozen=True)
+def output_folder(default: Any = MISSING) -> Any:
+    """Return the field of a command's output folder."""
+    return keyword(default, "output folder", free=True)
+
+
+def output_file(default: Any = MISSING) -> Any:
+    """Return the field of a command's output file."""
+    return keyword(default, "output file")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Output(Replacing):
     """The output folder of a command."""
 
-    output_dir: Path = option(MISSING, "output folder", free=True)
+    output_dir: Path = output_folder()
 
     @contextmanager
-    def open(self, options: Any, *sources: Path) -> Generator[Path]:
+    def open(self, *sources: Path, saved: Any = None) -> Generator[Path]:
         """Lock and prepare the folder, and write the options to `config.yaml`; a resumed run must have the same ones.
 
-        Raises what `prepare_output` and `check_same_options` raise.
+        sources: further inputs, which must not be replaced. saved: options to write in place of the command's. Raises
+        what `prepare_output` and `check_same_options` raise.
         """
-        folder, resume = self.output_dir, getattr(self, "resume", False)
-        with exclusive(folder):
-            if resume:  # before anything is deleted
-                check_same_options(folder, options)
-            sources = (*_inputs(options), *sources)
-            kind = kind_of_output(options)
-            prepare_output(folder, kind, resume=resume, overwrite=self.overwrite, sources=sources)
-            save_options(folder, options)
-            yield folder
+        with self.lock(*sources, saved=saved) as prepare:
+            prepare()
+            yield self.output_dir
+
+    def lock(self, *sources: Path, saved: Any = None) -> Any:
+        """Return a context manager like `open`, in which a function that it yields prepares the folder."""
+        options = saved or self
+        kinds = {self.output_dir: output_of(type(options).__name__)}
+        return locked(kinds, self, options, [*_inputs(options), *sources])
 
 
-def kind_of_output(options: Any) -> str:
-    """Return the kind of folder into which a command with these options writes."""
-    return output_of(type(options).__name__)
-
-
-def _inputs(options: Any) -> list[Path]:
-    """Return the paths in a command's options, except its output folder."""
-    found = list[Path]()
-    for one in options_of(type(options)):
-        value = one.value(options)
-        if isinstance(value, dict):  # `--policy.path` and `--policy.states` of a fit
-            value = [value[name] for name in ("path", "states") if isinstance(value.get(name), str)]
-        if one.name != "output_dir":
-            items = value if isinstance(value, list) else [value]
-            found += [Path(item).expanduser() for item in items if isinstance(item, Path) or one.is_open]
-            words = [word for item in items if isinstance(item, str) for word in (item, *item.split(":"))]
-            found += [Path(word) for word in words if word and Path(word).is_file()]  # of a task, a suite, a mesh, ...
-    return found
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ResumableOutput(Output, Resumable):
     """The output folder of a command that can be resumed."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class OutputFile(Replacing):
     """The output file of a command."""
 
-    output: Path = option(MISSING, "output file")
+    output: Path = output_file()
 
     def check(self) -> None:
         """Raise `UsageError` if the file exists, unless it may be replaced and this program wrote it."""
@@ -108,32 +92,78 @@ class OutputFile(Replacing):
             raise UsageError(f"{self.output} already exists; choose another name, or give --overwrite=true")
 
 
-def prepare_output(
-    folder: Path, kind: str, *, resume: bool = False, overwrite: bool = False, sources: Sequence[Path] = ()
-) -> None:
-    """Prepare `folder` for writing: on return it is absent or empty, unless `resume`.
+@contextmanager
+def locked(
+    kinds: Mapping[Path, str], how: Replacing, options: Any, sources: Iterable[Path] = ()
+) -> Generator[Callable[[], None]]:
+    """Lock the first of a command's output folders; yield a function that prepares all of them.
 
     Args:
-        folder: The output folder.
-        kind: Kind of folder that may be replaced, as `kind_of` names it.
+        kinds: Folder -> its kind, as `kind_of` names it. The options are written to the last.
+        how: Whether to replace what is there, or to continue it.
+        options: The command's options.
+        sources: Input paths, which must not be replaced.
+    """
+    first, *_ = kinds
+    *_, home = kinds
+
+    def prepare() -> None:
+        resume = getattr(how, "resume", False)
+        if resume:  # before anything is deleted
+            check_same_options(home, options)
+        prepare_output(kinds, resume=resume, overwrite=how.overwrite, sources=sources)
+        save_options(home, options)
+
+    new = [parent for parent in first.parents if not parent.exists()]
+    try:
+        with exclusive(first):
+            yield prepare
+    finally:
+        for parent in new:
+            with suppress(OSError):
+                parent.rmdir()  # if nothing was written
+
+
+def _inputs(options: Any) -> Iterator[Path]:
+    """Yield the paths in a command's options that exist, except its output folder."""
+    waiting: list[Any] = [{name: value for name, value in to_plain(options).items() if name != "output_dir"}]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, dict | list):
+            waiting += value.values() if isinstance(value, dict) else value
+        elif isinstance(value, str):
+            words = (value, *value.split(":"))  # also `mesh:FILE:LENGTH` and `carry:FILE`
+            yield from (path for word in words if word and (path := Path(word).expanduser()).exists())
+
+
+def prepare_output(
+    kinds: Mapping[Path, str], *, resume: bool = False, overwrite: bool = False, sources: Iterable[Path] = ()
+) -> None:
+    """Prepare folders for writing: on return they are absent or empty, unless `resume`.
+
+    Args:
+        kinds: Folder -> the kind of folder that may be replaced, as `kind_of` names it.
         resume: Whether to continue with what is there.
         overwrite: Whether to delete what is there.
         sources: Input paths, which must not be replaced.
 
-    Raises what `require_writable` raises.
+    Raises:
+        UsageError: what `require_writable` raises, and for options that contradict each other.
     """
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
-    if resume:
-        for left in folder.rglob(f".*{PARTIAL}"):  # files of a killed writer; `new_folder` clears partial folders
-            if left.is_file():
-                left.unlink()
-    elif folder.exists():
+    for folder, kind in () if resume else kinds.items():  # all of them, before one is emptied
         require_writable(folder, kind, overwrite, sources)
-        clear(folder)
+    for folder in kinds:
+        if resume:
+            for left in folder.rglob(f".*{PARTIAL}"):  # files of a killed writer; `new_folder` clears partial folders
+                if left.is_file():
+                    left.unlink()
+        elif folder.exists():
+            clear(folder)
 
 
-def require_writable(folder: Path, kind: str, overwrite: bool, sources: Sequence[Path] = ()) -> None:
+def require_writable(folder: Path, kind: str, overwrite: bool, sources: Iterable[Path] = ()) -> None:
     """Raise `UsageError` unless `folder` is absent or empty, or `overwrite` is set and it is a folder of this kind.
 
     Args:
@@ -143,15 +173,15 @@ def require_writable(folder: Path, kind: str, overwrite: bool, sources: Sequence
         sources: Input paths, which must not be replaced.
     """
     if overwrite and kind_of(folder) != "":
-        overlapping = [source for source in sources if source.resolve().is_relative_to(folder.resolve())]
-        if overlapping:
-            raise UsageError(f"{folder} overlaps {overlapping[0]}; expected a separate folder")
+        for source in sources:
+            if source.resolve().is_relative_to(folder.resolve()):
+                raise UsageError(f"{folder} overlaps {source}; expected a separate folder")
     require_replaceable(folder, kind if overwrite else "")
 
 
-def write_page(page: Report, path: Path, options: Any) -> None:
-    """Write a report, with the command line and the resolved options that made it."""
-    replace(page, command=command_line(), config=to_plain(options)).write(path)
+def about(options: Any) -> dict[str, Any]:
+    """Return the fields of a `Report` that say how it was made: the command line and the resolved options."""
+    return {"command": command_line(), "config": to_plain(options)}
 
 
 def publish(
@@ -164,17 +194,15 @@ def publish(
 ) -> None:
     """Write a result as JSON, and its report beside it if there is one; print its tables, lines and files.
 
-    options: as for `write_page`.
+    options: as for `about`.
     """
-    from manip_il.evaluation.tables import print_table
-
     written = [f"result: {path}"]
     write_json(path, content)
     if page is not None:
-        write_page(page, path.with_name(REPORT_FILE), options)
+        replace(page, **about(options)).write(path.with_name(REPORT_FILE))
         written.append(f"report: {path.with_name(REPORT_FILE)}")
     for table in tables:
-        print_table(table)
+        table.print()
     say(*lines, *written)
 
 

@@ -27,10 +27,11 @@ from manip_il.cli.options import (
 )
 from manip_il.data.ownership import CONFIG_HEADER
 from manip_il.errors import ManipError, UsageError, nearest
-from manip_il.evaluation.policy_folder import hub_hint
+from manip_il.learn.policy_folder import hub_hint
 from manip_il.option import check_bound, type_of
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
+_EXPECTED = "a YAML file of options"
 _MOST_OFFERED = 3  # names that an error suggests
 type Known = Mapping[str, Option]
 
@@ -49,36 +50,36 @@ def parse[T](cls: type[T], words: Sequence[str], command: str = "COMMAND") -> T:
     command: the command's name, for error messages.
     """
     known = {option.name: option for option in options_of(cls)}
-    file = Option(CONFIG_PATH, (), Path, None, {})
-    raw = _read_words(words, known | {CONFIG_PATH: file}, command)
-    config = raw.pop(CONFIG_PATH, None)
-    layers = [] if config is None else [(config.value, read_yaml(Path(config.value), "a YAML file of options"))]
+    known[CONFIG_PATH] = Option(CONFIG_PATH, (), Path, None, {})
+    raw = _read_words(words, known, command)
+    file = raw.pop(CONFIG_PATH, None)
+    layers = [] if file is None else [(file.value, read_yaml(Path(file.value), _EXPECTED))]
     return from_layers(cls, layers, raw)
 
 
 def from_yaml[T](path: Path, cls: type[T]) -> T:
     """Read options from a YAML file, with defaults for the others."""
-    return from_layers(cls, [(str(path), read_yaml(path, "a YAML file of options"))])
+    return from_layers(cls, [(str(path), read_yaml(path, _EXPECTED))])
 
 
-def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: dict[str, _Value] | None = None) -> T:
+def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str, _Value] | None = None) -> T:
     """Read options from trees of YAML; later trees override earlier ones, and `words` override all.
 
     layers: pairs (origin, tree); error messages name the origin. Raises `UsageError` as `parse` does.
     """
-    known, raw = {option.name: option for option in options_of(cls)}, dict[str, _Value]()
+    known = {option.name: option for option in options_of(cls)}
+    raw = dict[str, _Value]()
     for origin, tree in layers:
         raw |= _read_tree(tree, known, origin)
-    values: dict[tuple[str, ...], Any] = {}
-    for name, one in (raw | (words or {})).items():
+    values = {option.path: option.default for option in known.values() if not option.is_given}
+    for name, one in (raw | dict(words or {})).items():
         option = one.option
         if option.is_open:
-            held = values.setdefault(option.path, dict(option.default))
-            held[name.removeprefix(f"{option.name}.")] = _decode(one)
+            values[option.path] = values.get(option.path, {}) | {name.removeprefix(f"{option.name}."): _decode(one)}
         elif one.value is not None or without_none(option.type) != option.type:  # other nulls mean the default
             values[option.path] = _decode(one)
     for option in known.values():
-        if option.default is MISSING and option.path not in values:
+        if option.default is MISSING and values.get(option.path, MISSING) is MISSING:
             raise UsageError(f"{option.label} is missing; expected {metavar(option.type)}")
     return _build(cls, values)
 
@@ -106,36 +107,27 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _
     """Return each option's value as given on the command line."""
     raw: dict[str, _Value] = {}
     places = [option for option in known.values() if option.positional]
-    rest = list(words)
-    while rest:
-        word = rest.pop(0)
-        if word == "--" and places and places[-1].is_list:  # the rest is another program's command line
-            raw[places[-1].name] = _Value(places[-1], rest, places[-1].label)
-            break
-        if not word.startswith("--"):
-            if not places or word.startswith("-"):
-                wanted = f"write options as --name=value; manip-il {command} --help=all lists them"
-                raise UsageError(f"unexpected {shorten(word)}; {wanted}")
-            option = places[0] if places[0].is_list else places.pop(0)
-            before = raw[option.name].value if option.is_list and option.name in raw else []
-            raw[option.name] = _Value(option, [*before, word] if option.is_list else word, option.label)
-            continue
+    for number, word in enumerate(words):
         name, equals, value = word[2:].partition("=")
-        if _find(ours := name.replace("-", "_"), known):  # accept --output-dir
-            name = ours
-        option = _find(name, known)
-        if option is None or option.positional:
-            raise _unknown_option("option", name, known, "--", command)
-        kind = Any if option.is_open else option.type
-        if not equals and kind is bool and (not rest or rest[0] not in ("true", "false")):
-            value = "true"
-        elif not equals:
-            if not rest or rest[0].startswith("--"):
-                raise UsageError(f"--{name} has no value; expected {metavar(kind)}")
-            value = rest.pop(0)
-        if name == CONFIG_PATH and name in raw:
-            raise UsageError(f"--{CONFIG_PATH} is given twice; expected one file")
-        raw[name] = _Value(option, from_word(kind, value), f"--{name}")
+        if word == "--" and places and places[-1].is_list:  # the rest is another program's command line
+            raw[places[-1].name] = _Value(places[-1], list(words[number + 1 :]), places[-1].label)
+            break
+        if word.startswith("--"):
+            name = name.replace("-", "_")  # accept --output-dir
+            option = _find(name, known)
+            if option is None or option.positional:
+                raise _unknown_option("option", name, known, "--", command)
+            kind = Any if option.is_open else option.type
+            if not equals and kind is not bool:
+                raise UsageError(f"--{name} has no value; write --{name}=VALUE, expected {metavar(kind)}")
+            raw[name] = _Value(option, from_word(kind, value if equals else "true"), f"--{name}")
+        elif not places or word.startswith("-"):
+            wanted = f"write options as --name=value; manip-il {command} --help=all lists them"
+            raise UsageError(f"unexpected {shorten(word)}; {wanted}")
+        elif (option := places[0]).is_list:
+            raw.setdefault(option.name, _Value(option, [], option.label)).value.append(word)
+        else:
+            raw[option.name] = _Value(places.pop(0), word, option.label)
     return raw
 
 
@@ -165,20 +157,16 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
     return raw
 
 
-def _build(cls: Any, values: Mapping[tuple[str, ...], Any], base: Any = None, path: tuple[str, ...] = ()) -> Any:
-    """Return an instance of `cls`. values: those given, by path; other fields are as in `base`, else the defaults."""
+def _build(cls: Any, values: Mapping[tuple[str, ...], Any], path: tuple[str, ...] = ()) -> Any:
+    """Return an instance of `cls`. values: of its options, by path."""
     arguments: dict[str, Any] = {}
     for field in dataclasses.fields(cls):
-        here = (*path, field.name)
-        kind = type_of(cls, field)
-        default = default_of(field, base)
+        here, kind = (*path, field.name), type_of(cls, field)
         if "given" in field.metadata:
             raw = {inner[-1]: value for inner, value in values.items() if inner[:-1] == here}
-            arguments[field.name] = default | raw
-        elif dataclasses.is_dataclass(kind):
-            arguments[field.name] = _build(kind, values, None if default is MISSING else default, here)
+            arguments[field.name] = default_of(field) | raw
         else:
-            arguments[field.name] = values.get(here, default)
+            arguments[field.name] = _build(kind, values, here) if dataclasses.is_dataclass(kind) else values[here]
     return cls(**arguments)
 
 

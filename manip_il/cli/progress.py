@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shlex
 import signal
 import sys
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO, override
+
+from tqdm import tqdm
 
 from manip_il.errors import ManipError, UsageError, printable
-
-if TYPE_CHECKING:
-    from manip_il.algorithms.results import Watch
-    from manip_il.evaluation.results import EpisodeResult
-    from manip_il.mdp import Episode
+from manip_il.progress import Progress
 
 _STOPPING = b"\nstopping after the current step (press Ctrl-C again to stop at once)\n"
 
@@ -50,9 +49,15 @@ def warn(*lines: str) -> None:
         _print(f"manip-il: warning: {printable(' '.join(line.split()))}", sys.stderr)
 
 
-def _print(line: str, file: TextIO) -> None:
-    from tqdm import tqdm  # imported here because help does not need it
+class Warnings(logging.Handler):
+    """Prints what is logged as a warning."""
 
+    @override
+    def emit(self, record: logging.LogRecord) -> None:
+        warn(record.getMessage())
+
+
+def _print(line: str, file: TextIO) -> None:
     tqdm.write(line, file)  # above a bar, if there is one
     file.flush()
 
@@ -78,16 +83,20 @@ _PLAIN: dict[str, Any] = {
 }
 
 
-class Stages:
+class Stages(Progress):
     """Progress of work in stages, each a number of steps; use as a context manager.
 
     Shows a bar on a terminal, else lines like `record: 12/50 (3.40/s, success=0.92)`; nothing if progress is switched
-    off. The first Ctrl-C or SIGTERM stops the work after the current step, the second at once. kept: what is saved and
-    can be resumed, for the message if the work is interrupted or fails.
+    off. The first Ctrl-C or SIGTERM stops the work after the current step, the second at once.
+
+    kept: what is saved and can be resumed, for the message if the work is interrupted or fails. prepare: prepares the
+    output when the inputs have been checked.
     """
 
-    def __init__(self, kept: str = ""):
+    def __init__(self, kept: str = "", prepare: Callable[[], None] | None = None):
         self.kept = kept
+        self._prepare = prepare
+        self._has_output = prepare is None
         self._stopping = False
         self._handlers = dict[int, Any]()
         self._bar: Any = None
@@ -101,7 +110,9 @@ class Stages:
         self.close()
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
-        if self.kept and isinstance(error, ManipError | KeyboardInterrupt) and not isinstance(error, UsageError):
+        if not self._has_output or not self.kept or isinstance(error, UsageError):
+            return
+        if isinstance(error, ManipError | KeyboardInterrupt):
             prefix = f"{error}; " if error.args else ""
             error.args = (f"{prefix}kept: {self.kept}; continue with --resume=true",)
 
@@ -111,10 +122,14 @@ class Stages:
         self._stopping = True
         os.write(2, _STOPPING)  # print() is not reentrant, and a signal can interrupt one
 
-    def start(self, description: str, total: int | None) -> None:
-        """Close the previous stage's bar and open a new one. total: number of steps, None if unknown."""
-        from tqdm import tqdm
+    @override
+    def started(self) -> None:
+        if self._prepare is not None:
+            self._prepare()
+            self._has_output = True
 
+    @override
+    def start(self, description: str, total: int | None) -> None:
         self.close()
         self.check()
         how: dict[str, Any] = {"dynamic_ncols": True} if sys.stderr.isatty() else _PLAIN
@@ -122,46 +137,45 @@ class Stages:
         self._bar.delay = 0.0  # the delay only keeps the constructor from writing a line
         self._solved = 0
 
+    @override
     def close(self) -> None:
-        """Close the bar."""
         if self._bar is not None:
             self._bar.leave = self._bar.n > 0
             self._bar.close()
             self._bar = None
 
-    def step(self, n: int = 1, **fields: float) -> None:
-        """Count `n` finished steps. fields: shown beside the bar (loss=0.12, success=0.9) until replaced."""
+    @override
+    def step(self, n: int = 1, **numbers: float) -> None:
+        """Count `n` steps. numbers: shown beside the bar (loss=0.12, success=0.9) until replaced."""
         if self._bar is not None:
-            if fields:
-                self._bar.set_postfix(fields, refresh=False)
+            if numbers:
+                self._bar.set_postfix(numbers, refresh=False)
             self._bar.update(n)
         self.check()
 
-    def episode(self, episode: Episode | EpisodeResult) -> None:
-        """Count a finished episode."""
+    @override
+    def episode(self, episode: Any) -> None:
         self._solved += episode.success
         self.step(success=self._solved / (self._bar.n + 1) if self._bar is not None else 0.0)
 
+    @override
     def log(self, record: dict[str, Any]) -> None:
-        """Show that a fit or run has reached a step. record: `step` and metrics, or {} if there are none."""
         if record and self._bar is not None:
             shown = {name: record[name] for name in ("loss", "success", "kl") if name in record}
             self.step(record["step"] - self._bar.n, **shown)
+        self.check()
+
+    @override
+    def finished(self, result: Any) -> None:
+        self.close()
+        learnt = f"{result.labels:,} labels, validation success {result.validation.success}"
+        say(f"{result.unit} {result.number}: {learnt}, {sum(result.seconds.values()):.0f} s")
         self.check()
 
     def check(self) -> None:
         """Raise `KeyboardInterrupt` if the user has asked to stop."""
         if self._stopping:
             raise KeyboardInterrupt
-
-    def watch(self) -> Watch:
-        """Return the callbacks for a run of an algorithm."""
-        from manip_il.algorithms.results import Watch
-
-        def start(stage: str, round_: int, total: int) -> None:
-            self.start(f"round {round_}, {stage}", total)
-
-        return Watch(start, self.episode, self.log, self.step)
 
 
 @contextmanager

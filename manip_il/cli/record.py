@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from manip_il.cli.common_options import EngineOptions, Varied
-from manip_il.cli.options import Given, given, group
+from manip_il.cli.options import Given, given
 from manip_il.cli.outputs import Resumable
 from manip_il.data.video_config import VideoConfig
 from manip_il.option import Seeded, option
@@ -25,15 +25,15 @@ class DatasetGroup:
 
 
 @dataclass(frozen=True)
-class RecordOptions(Varied, Seeded, Resumable):
+class RecordOptions(Varied, Seeded, EngineOptions, Resumable):
     """Record successful demonstrations of the expert as a LeRobot dataset.
 
     Every finished episode is written to ROOT.journals at once; the dataset appears when all episodes are recorded.
     --resume=true continues a recording; --dataset.num_episodes may then be larger.
+
+    Example: manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos
     """
 
-    example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
     first: ClassVar[str] = "robot.type task.type dataset.root dataset.num_episodes cameras seed resume"
     env: Given = given(EnvConfig)
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
-    engine: EngineOptions = group(EngineOptions(), prefix="")

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 from manip_il.cli.common_options import OfDataset
-from manip_il.cli.options import group
-from manip_il.cli.outputs import Output, OutputFile
+from manip_il.cli.outputs import Output, OutputFile, output_file, output_folder
 from manip_il.option import Seeded, option
 
 
@@ -21,71 +20,75 @@ class OfPairs:
 
 
 @dataclass(frozen=True)
-class PairsOptions(Seeded):
+class PairsOptions(Seeded, OutputFile):
     """Choose pairs of clips from datasets of one task, for comparison by people (ask) or simulated teachers (answer).
 
     A SOURCE is a dataset or a run; each round of a DAgger run is one source. Without --reward all sources appear
     equally often. Episodes shorter than --clip are left out.
+
+    Example: manip-il reward pairs runs/dagger --count=200 --output=pairs.json
     """
 
-    example: ClassVar[str] = "manip-il reward pairs runs/dagger --count=200 --output=pairs.json"
     sources: list[Path] = option(MISSING, "manip-il datasets, or runs", positional=True)
     clip: int = option(20, "length of a clip [control steps]", at_least=1)
     count: int = option(200, "number of pairs", at_least=1)
     reward: Path | None = option(None, "a fitted reward, for pairs on which its networks disagree most", exists="")
-    file: OutputFile = group(OutputFile(Path("pairs.json")), prefix="")
+    output: Path = output_file("pairs.json")
 
 
 @dataclass(frozen=True)
-class AskOptions(OfPairs):
+class AskOptions(OfPairs, OutputFile):
     """Write a page that shows the pairs as films and asks which is better; it works offline and on a phone.
 
     Keys: left and right arrow, down for equal, S to skip, U to undo. The browser keeps the answers until they are saved
     as preferences.json.
+
+    Example: manip-il reward ask pairs.json --sources=runs/dagger --output=ask.html
     """
 
-    example: ClassVar[str] = "manip-il reward ask pairs.json --sources=runs/dagger --output=ask.html"
-    file: OutputFile = group(OutputFile(Path("ask.html")), prefix="")
+    output: Path = output_file("ask.html")
     robot: Path | None = option(None, "YAML file of the sources' robot, if it is your own")
 
 
 @dataclass(frozen=True)
-class AnswerOptions(OfPairs, Seeded):
+class AnswerOptions(OfPairs, Seeded, OutputFile):
     """Let a simulated teacher answer pairs by the clips' true progress (B-Pref, Lee et al. 2021).
 
     Teachers: perfect; boltzmann:TEMPERATURE, less certain if returns are close; mistaken:SHARE, wrong on that share
     of the pairs. A clip's return is the sum of progress over its steps.
+
+    Example: manip-il reward answer pairs.json --sources=runs/dagger --output=preferences.json
     """
 
-    example: ClassVar[str] = "manip-il reward answer pairs.json --sources=runs/dagger --output=preferences.json"
     teacher: str = option("perfect", "perfect, boltzmann[:TEMPERATURE] (default 1) or mistaken[:SHARE] (default 0.1)")
-    file: OutputFile = group(OutputFile(Path("preferences.json")), prefix="")
+    output: Path = output_file("preferences.json")
 
 
 @dataclass(frozen=True)
-class FitOptions(OfPairs, Seeded):
+class FitOptions(OfPairs, Seeded, Output):
     """Fit a reward of state and action to answers about pairs (Bradley-Terry), as an ensemble of small networks.
 
     Each pair is held out from one network; fit.json has the agreement on held-out pairs. ANSWERS are files from ask or
     answer, by one person or several, about PAIRS or --more_pairs. OUTPUT_DIR/pretrained_model holds the reward.
+
+    Example: manip-il reward fit pairs.json preferences.json --sources=runs/dagger
+    --output_dir=runs/reward
     """
 
-    example: ClassVar[str] = (
-        "manip-il reward fit pairs.json preferences.json --sources=runs/dagger --output_dir=runs/reward"
-    )
     answers: list[Path] = option(MISSING, "preferences.json from ask or answer", positional=True, exists="")
     more_pairs: list[Path] = option(list, "further pairs.json of the same task and clip length", exists="")
     members: int = option(8, "number of networks in the ensemble, and of folds of the pairs", at_least=3, at_most=64)
-    output: Output = group(Output(Path("runs/reward")), prefix="")
+    output_dir: Path = output_folder("runs/reward")
 
 
 @dataclass(frozen=True)
-class IrlOptions(OfDataset, Seeded):
+class IrlOptions(OfDataset, Seeded, Output):
     """Learn the weights of a reward from a dataset of demonstrations of the task carry.
 
     Writes reward.json, for --task.type=carry:FILE, and report.html, with the weights and maps of the cost.
+
+    Example: manip-il reward irl datasets/carry --method=bayesian --output_dir=runs/irl
     """
 
-    example: ClassVar[str] = "manip-il reward irl datasets/carry --method=bayesian --output_dir=runs/irl"
     method: Literal["max_margin", "bayesian", "max_entropy"] = option("max_entropy", "algorithm")
-    output: Output = group(Output(Path("runs/irl")), prefix="")
+    output_dir: Path = output_folder("runs/irl")

@@ -20,9 +20,10 @@ class ServeOptions(Varied, Trusting):
     and presses its keys as a person would: an episode ends when the task is solved, and a failed one is recorded
     again. --vary=servo also varies the servos. A policy as the leader (--leader=runs/lift) sets the default task and
     cameras.
+
+    Example: manip-il serve --task.type=lift --cameras=front,wrist
     """
 
-    example: ClassVar[str] = "manip-il serve --task.type=lift --cameras=front,wrist"
     first: ClassVar[str] = "task.type cameras leader servo log output_dir"
     command: list[str] = option(list, "a LeRobot program and its options, after `--`", positional=True)
     env: Given = given(EnvConfig, robot="so101")

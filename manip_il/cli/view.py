@@ -31,9 +31,10 @@ class ViewOptions(Tested, Seeded, Trusting):
     Episodes run in real time until --n_episodes have ended, the window is closed or Ctrl-C is pressed. The browser
     shows pictures, joints, actions, phase and progress. --output writes these as fast as possible to a file, which
     `rerun FILE.rrd` opens on any machine.
+
+    Example: manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd
     """
 
-    example: ClassVar[str] = "manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd"
     first: ClassVar[str] = "policy.path policy.type robot.type task.type n_episodes output"
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, override
 import numpy as np
 
 from manip_il.collect.rollout import Act, Turn
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import F64, Actor
 from manip_il.robots.action_space import ActionSpace
 from manip_il.seeding import rng_for
@@ -38,12 +39,12 @@ class Setting:
 class Driver:
     """Base class of drivers. They must be picklable.
 
-    beta: share of the steps that the expert drives. policies: `pretrained_model` folders; the first policy drives.
+    beta: share of the steps that the expert drives. policies: the first one drives.
     """
 
     kind: ClassVar[str]
     beta: float = 0.0
-    policies: tuple[Path, ...] = ()
+    policies: tuple[Checkpoint, ...] = ()
 
     @property
     def name(self) -> str:
@@ -107,10 +108,16 @@ class PolicyDriver(Driver):
     """
 
     kind = "policy"
-    policies: tuple[Path, ...] = ()
+    policies: tuple[Checkpoint, ...] = ()
     beta: float = 0.0
     trust: bool = False
     device: str = "cpu"
+
+    @classmethod
+    def of(cls, *policies: Checkpoint | Path, **settings: Any) -> PolicyDriver:
+        """Return the driver of checkpoints, or of `pretrained_model` folders, which are opened here."""
+        opened = (one if isinstance(one, Checkpoint) else Checkpoint.open(one) for one in policies)
+        return cls(tuple(opened), **settings)
 
     @override
     def start(self, setting: Setting) -> Act:

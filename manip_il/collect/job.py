@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manip_il.collect.drivers import Driver, ExpertDriver, PolicyDriver, Setting
@@ -26,6 +25,7 @@ from manip_il.worlds.table import env_spec, make_env, make_expert
 if TYPE_CHECKING:  # torch is imported only if a learner drives
     from manip_il.learn.policy import LearnedPolicy
 
+HOLD = 10  # control steps for which an episode continues after success, to see whether success lasts
 LOCKSTEP = 25  # environments that share one call of the policy
 OWN_MODELS = 8  # lockstep limit if each environment has its own model (26 MB for the Panda)
 
@@ -57,8 +57,8 @@ class RolloutJob:
         check_bounds(self)
 
     @property
-    def policy(self) -> Path | None:
-        """The `pretrained_model` folder of the policy that drives."""
+    def policy(self) -> Checkpoint | None:
+        """The policy that drives."""
         return next(iter(self.driver.policies), None)
 
     @property
@@ -110,7 +110,7 @@ def run_steps(
     job: RolloutJob, envs: Sequence[Environment], seeds: Iterable[int], act: Act | None = None
 ) -> Iterator[Transition]:
     """Run a job's episodes in these environments and yield every step. act: replaces the job's driver."""
-    policies = tuple(_load(job, path) for path in job.driver.policies)
+    policies = tuple(_load(job, checkpoint) for checkpoint in job.driver.policies)
     setting = Setting(envs[0].actions, job.env.horizon, policies)
     rules = Rules(job.env.horizon, job.hold, job.patience, takeover=job.label == "takeover")
     gate = gate_of(job.label, job.query, setting)
@@ -122,20 +122,19 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
 
     Raises `MismatchError` if the recorded cameras do not include those of the policy.
     """
-    wanted = Checkpoint.open(job.policy).cameras if job.policy is not None else None
-    if wanted is None or job.cameras is None:
+    wanted = job.policy.cameras if job.policy is not None else None
+    if job.policy is None or wanted is None or job.cameras is None:
         return job.cameras or wanted
     if not set(wanted.names) <= set(job.cameras.names) or wanted.size != job.cameras.size:
-        raise MismatchError("choice or size of cameras", str(job.policy), wanted, "the recording", job.cameras)
+        raise MismatchError("choice or size of cameras", str(job.policy.path), wanted, "the recording", job.cameras)
     return job.cameras
 
 
-def _load(job: RolloutJob, path: Path) -> LearnedPolicy:
+def _load(job: RolloutJob, checkpoint: Checkpoint) -> LearnedPolicy:
     from manip_il.learn.policy import LearnedPolicy
 
     driver = job.driver
     trust, device = (driver.trust, driver.device) if isinstance(driver, PolicyDriver) else (False, "cpu")
-    checkpoint = Checkpoint.open(path)
     spec = env_spec(job.env, observed_cameras(job))
     checkpoint.check_fits(spec)
     return LearnedPolicy.load(checkpoint, device, spec.instruction, trust=trust)

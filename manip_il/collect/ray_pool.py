@@ -65,7 +65,7 @@ class RayPool:
 
     def submit(self, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None) -> Future[list[Episode]]:
         """Submit some seeds of a job to the cluster."""
-        files = [self._upload(folder) for folder in job.driver.policies]
+        files = [self._upload(policy.path) for policy in job.driver.policies]
         task = self._upload(job.env.task) if isinstance(job.env.task, Path) else None
         mesh = self._upload(path) if (path := mesh_path(job.env.object)) else None
         reference = _run_remote.remote(__version__, job, seeds, journal, task, mesh, *files)
@@ -128,8 +128,9 @@ def run_there(
             at = _unpack(mesh, Path(folder) / "mesh") / name
             job = replace(job, env=replace(job.env, object=Path(f"mesh:{at}")))
         if isinstance(job.driver, PolicyDriver):
-            here = tuple(_unpack(files, Path(folder) / str(number)) for number, files in enumerate(policies))
-            job = replace(job, driver=replace(job.driver, policies=here))
+            here = (_unpack(files, Path(folder) / str(number)) for number, files in enumerate(policies))
+            moved = tuple(map(lambda one, path: replace(one, path=path), job.driver.policies, here))
+            job = replace(job, driver=replace(job.driver, policies=moved))
         found = [(one.without_pictures(), journal.encode(one) if journal else b"") for one in job.run(seeds)]
         return zstandard.compress(pickle.dumps(found), _LEVEL)
 

@@ -16,6 +16,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
+from contextlib import AbstractContextManager, nullcontext
 from itertools import islice
 from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
@@ -116,6 +117,11 @@ class Engine:
                     raise ManipError(
                         f"seed {seed} killed its worker twice (out of memory?); finished episodes are kept"
                     ) from None
+
+
+def engine_of(workers: int | Engine | None) -> AbstractContextManager[Engine]:
+    """Return the context of a new engine, or of a given one, which stays open."""
+    return nullcontext(workers) if isinstance(workers, Engine) else Engine(workers)
 
 
 class LocalPool:

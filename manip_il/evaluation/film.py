@@ -18,8 +18,8 @@ from manip_il.data import schema
 from manip_il.errors import RenderError
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.runner import Progress
 from manip_il.mdp import Episode
+from manip_il.progress import Progress
 from manip_il.sim.config import FILM, CameraConfig
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.contract import Unable

@@ -15,6 +15,8 @@ from manip_il.data.atomic import write_file
 from manip_il.evaluation.figures import Figure
 from manip_il.evaluation.tables import Table
 
+REPORT_FILE = "report.html"
+
 
 @dataclass(frozen=True)
 class Film:

@@ -10,13 +10,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.collect.job import RolloutJob
+from manip_il.collect.job import HOLD, RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.errors import RenderError, UsageError
 from manip_il.evaluation.figures import INK, Figure, drawing, to_figure
 from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.results import EpisodeResult, EvalResult
-from manip_il.evaluation.runner import HOLD, evaluate
+from manip_il.evaluation.runner import evaluate
 from manip_il.evaluation.suites import read_condition
 from manip_il.evaluation.tables import CLONING, EXPERT, INTERVAL, Table
 from manip_il.option import NameOrPath

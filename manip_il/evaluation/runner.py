@@ -3,53 +3,32 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from manip_il.caching import PerThread
-from manip_il.collect.drivers import ExpertDriver, PolicyDriver
-from manip_il.collect.job import RolloutJob, observed_cameras
+from manip_il.collect.job import HOLD, RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.json_lines import append_line, read_lines
 from manip_il.errors import MismatchError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, EvalSettings
-from manip_il.evaluation.suites import suite_conditions
-from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import F64, Episode, State
-from manip_il.sim.conditions import NOMINAL, Condition, draw, turn_of
+from manip_il.progress import Progress
+from manip_il.sim.conditions import NOMINAL, draw, turn_of
 from manip_il.sim.world import World
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import described_env, env_fingerprint, env_spec
 
-HOLD = 10  # control steps for which an episode continues after success, to see whether success lasts
 CHECK_EVERY = 100  # number of episodes between checks of the interval's width
 EPISODES_FILE = "episodes.jsonl"
 FOLDER = "evaluations"  # folder for the evaluations of several policies
 _world = PerThread(World, 1)
-
-
-class Progress(Protocol):
-    """Interface for showing progress, in stages of a given number of episodes or steps."""
-
-    def start(self, description: str, total: int) -> None:
-        """Begin a stage."""
-
-    def episode(self, episode: Episode | EpisodeResult) -> None:
-        """Count an episode."""
-
-    def step(self) -> None:
-        """Count a step."""
-
-    def close(self) -> None:
-        """End the stage."""
 
 
 def evaluate(
@@ -96,7 +75,7 @@ def evaluate(
         fingerprint=env_fingerprint(job.env, observed_cameras(job)),
         episodes=tuple(results[seed] for seed in asked if seed in results),
         settings=EvalSettings.of(job, suite),
-        policy_sha256=policy_sha256(job.policy) if job.policy is not None else "",
+        policy_sha256=job.policy.sha256 if job.policy is not None else "",
         until_width=until_width,
     )
 
@@ -181,7 +160,7 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
     """
     path = folder / EPISODES_FILE
     common: dict[str, Any] = {
-        "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver.name,
+        "policy_sha256": job.policy.sha256 if job.policy is not None else job.driver.name,
         "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
         "settings": EvalSettings.of(job, suite).to_json(),
     }
@@ -203,29 +182,3 @@ def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]
         raise MismatchError("what is drawn for the episode", "the file", drawn, "the replay", now["drawn"])
     compared = ("success", "success_at_end", "steps", "return")
     return [f"{name} was {was[name]}, is {now[name]}" for name in compared if was[name] != now[name]]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Environment, seeds and conditions of a test; trust: whether to load models that checkpoints refer to."""
-
-    env: EnvConfig
-    seeds: range
-    suite: str = "nominal"
-    conditions: tuple[Condition, ...] = ()
-    trust: bool = False
-
-    @classmethod
-    def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path] = (), trust: bool = False) -> Trial:
-        """Return a trial under a suite's conditions, without camera conditions if no policy uses cameras."""
-        sees = any(Checkpoint.open(policy).pictures for policy in policies)
-        return cls(env, seeds, suite, suite_conditions(suite, env, sees=sees), trust)
-
-    def job(self, policy: Path | None) -> RolloutJob:
-        """Return the job that runs a policy, or the expert if it is None."""
-        driver = ExpertDriver() if policy is None else PolicyDriver((policy,), trust=self.trust)
-        return RolloutJob(self.env, driver, episode_hold(self.env), label="last", conditions=self.conditions)
-
-    def measure(self, policy: Path | None, name: str, folder: Path, engine: Engine, progress: Progress) -> EvalResult:
-        """Return the evaluation of a policy, or of the expert, in `folder`; see the function `measure`."""
-        return measure(engine, self.job(policy), self.seeds, name, folder, progress, suite=self.suite)

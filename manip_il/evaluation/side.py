@@ -9,15 +9,12 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from manip_il.collect.workers import Engine
-from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.json_lines import read_lines
 from manip_il.errors import UsageError
-from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.results import FILE_NAME, EvalResult, require_equal
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
-from manip_il.evaluation.runner import FOLDER, Progress, Trial
 from manip_il.evaluation.tables import DAGGER
+from manip_il.learn.policy_folder import find_policy
 from manip_il.worlds.config import EnvConfig
 
 _SEED_FOLDER = re.compile(r"seed_(\d+)")
@@ -112,15 +109,6 @@ class Side:
         """The rounds of each member; empty unless all are runs."""
         runs = tuple(member.history for member in self.members)
         return runs if all(runs) else ()
-
-    def measure(self, trial: Trial, folder: Path, engine: Engine, progress: Progress) -> Side:
-        """Return the side with the evaluations of its policies, saved in `folder`."""
-        measured: list[Member] = []
-        for member, policy in zip(self.members, self.policies, strict=True):
-            words = f"{re.sub(r'[^A-Za-z0-9]+', '_', member.name)[-80:]}_{policy_sha256(policy)[:8]}"
-            result = trial.measure(policy, member.name, folder / FOLDER / words, engine, progress)
-            measured.append(replace(member, result=result))
-        return replace(self, members=tuple(measured))
 
 
 def select_rounds(rule: Rule, sides: Sequence[Side]) -> tuple[Rule, tuple[Side, ...]]:

@@ -37,17 +37,16 @@ class Table:
         rows = tuple(tuple(row[i] for i in keep) for row in self.rows)
         return Table(tuple(self.columns[i] for i in keep), rows, self.colours)
 
-
-def print_table(table: Table) -> None:
-    """Print the non-empty columns as plain text."""
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console.width = _PLAIN_WIDTH
-    table = table.filled()
-    drawn = RichTable(box=box.ASCII2, pad_edge=False)
-    for index, name in enumerate(table.columns):
-        drawn.add_column(Text(name), justify="right" if index else "left")
-    for row in table.rows:
-        # Text objects, because Rich would parse the brackets of an interval as markup
-        drawn.add_row(*(Text(printable(cell or "-")) for cell in row))
-    console.print(drawn)
+    def print(self) -> None:
+        """Print the non-empty columns as plain text."""
+        console = Console(highlight=False)
+        if not console.is_terminal:
+            console.width = _PLAIN_WIDTH
+        table = self.filled()
+        drawn = RichTable(box=box.ASCII2, pad_edge=False)
+        for index, name in enumerate(table.columns):
+            drawn.add_column(Text(name), justify="right" if index else "left")
+        for row in table.rows:
+            # Text objects, because Rich would parse the brackets of an interval as markup
+            drawn.add_row(*(Text(printable(cell or "-")) for cell in row))
+        console.print(drawn)

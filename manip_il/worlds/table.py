@@ -57,6 +57,14 @@ def make_config(
     return complete(make_options(EnvConfig, control_hz=control_hz, **settings))
 
 
+def env_of_name(env: EnvConfig | str) -> EnvConfig:
+    """Return the environment of a name, `panda` or `panda/lift`; settings as they are."""
+    if not isinstance(env, str):
+        return env
+    robot, _, task = env.partition("/")
+    return make_config(robot, task or EnvConfig.task)
+
+
 def stored_config(
     spec: Any, robot: NameOrPath | None = None, task: NameOrPath | None = None, shape: NameOrPath | None = None
 ) -> EnvConfig:

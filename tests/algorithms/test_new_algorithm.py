@@ -9,15 +9,17 @@ from pathlib import Path
 import pytest
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.algorithms.results import Result, Watch
+from manip_il.algorithms.results import Result
 from manip_il.algorithms.rounds import Rollouts, mixture
 from manip_il.algorithms.run import Run
 from manip_il.collect.workers import Engine
 from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Episode
+from manip_il.progress import Progress
 from manip_il.worlds.table import make_config
 
+from ..conftest import watching
 from ..damage import check_same_data
 
 pytestmark = pytest.mark.slow
@@ -48,7 +50,7 @@ def halves(run: Run, c: RunConfig) -> Iterator[Result]:
     yield run.validate(run.fit([data]))
 
 
-def follow(algorithm, folder: Path, watch: Watch | None = None) -> list[Result]:
+def follow(algorithm, folder: Path, watch: Progress | None = None) -> list[Result]:
     run = Run(CONFIG, folder, Engine(), watch)
     return list(run.follow(algorithm(run, CONFIG)))
 
@@ -70,7 +72,7 @@ def test_a_new_algorithm_goes_on_where_it_was_stopped_to_the_same_bytes(algorith
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        follow(algorithm, tmp_path / "again", Watch(on_episode=stop))
+        follow(algorithm, tmp_path / "again", watching(episode=stop))
     again = follow(algorithm, tmp_path / "again")
     assert [result.validation for result in again] == [result.validation for result in whole]
     check_same_data(tmp_path / "again", tmp_path / "whole")

@@ -11,7 +11,7 @@ import pytest
 
 from manip_il.algorithms import run as runs
 from manip_il.algorithms.config import BetaSchedule, RunConfig
-from manip_il.algorithms.results import Result, Watch, best_result
+from manip_il.algorithms.results import Result, best_result
 from manip_il.algorithms.rounds import round_folder
 from manip_il.algorithms.run import Run
 from manip_il.collect.workers import Engine
@@ -24,6 +24,7 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.table import make_config
 
+from ..conftest import watching
 from ..damage import check_same_data, digests
 from ..learn.tiny_policies import ACT
 
@@ -51,7 +52,7 @@ def datasets(folder: Path, last: int) -> list[Path]:
 def run(tmp_path_factory) -> tuple[Path, list[Result], list[Episode]]:
     """One whole run: its folder, its rounds, and every episode that it made."""
     folder, made = tmp_path_factory.mktemp("dagger"), list[Episode]()
-    results = list(Run(CONFIG, folder, Engine(), Watch(on_episode=made.append)).results())
+    results = list(Run(CONFIG, folder, Engine(), watching(episode=made.append)).results())
     return folder, results, made
 
 
@@ -117,7 +118,7 @@ def test_running_it_again_computes_nothing_anew(run, monkeypatch):
 
     monkeypatch.setattr(Engine, "run", refuse)
     logged: list[dict] = []
-    again = list(Run(CONFIG, folder, Engine(), Watch(on_log=logged.append)).results())
+    again = list(Run(CONFIG, folder, Engine(), watching(log=logged.append)).results())
     assert logged == []
     assert [replace(result, seconds={}) for result in again] == [replace(result, seconds={}) for result in results]
     assert digests(folder) == before
@@ -139,7 +140,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episode
             raise Stop
 
     with pytest.raises(Stop):
-        list(Run(CONFIG, tmp_path, Engine(), Watch(on_episode=stop)).results())
+        list(Run(CONFIG, tmp_path, Engine(), watching(episode=stop)).results())
     again = list(Run(CONFIG, tmp_path, Engine()).results())
     assert [result.validation for result in again] == [result.validation for result in results]
     assert [line["round"] for line in read_lines(tmp_path / "metrics.jsonl")] == [one.number for one in results]

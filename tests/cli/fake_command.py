@@ -6,7 +6,7 @@ import os
 import signal
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 from manip_il.cli.progress import Stages, say
 from manip_il.errors import ManipError, UsageError
@@ -23,9 +23,10 @@ class FakeOptions:
     """Do what the tests ask.
 
     And say so.
+
+    Example: manip-il fake --act=say
     """
 
-    example: ClassVar[str] = "manip-il fake --act=say"
     act: Literal["say", "fail", "usage", "bug", "stop", "interrupt"] = "say"
     dataset: Group = field(default_factory=Group)
     resume: bool = False

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.outputs import ResumableOutput, save_options
+from manip_il.cli.outputs import save_options
+from manip_il.collect.job import HOLD
 from manip_il.data import schema
 from manip_il.data.json_lines import append_line
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
-from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.mdp import Episode
 from manip_il.worlds.config import EnvConfig
@@ -64,7 +64,7 @@ def make_run(
     """A finished run of as many rounds as successes, each with a policy of its own."""
     folder.mkdir(parents=True, exist_ok=True)
     settings = {"seed": seed, "rounds": len(successes) - 1}
-    save_options(folder, replace(OPTIONS, settings=settings, output=ResumableOutput(folder)))
+    save_options(folder, replace(OPTIONS, settings=settings, output_dir=folder))
     for number, success in enumerate(successes):
         made = folder / f"round_{number:03d}" / "policy" / "checkpoints" / "last" / "pretrained_model"
         shutil.copytree(policy, made)

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from manip_il.cli.main import COMMANDS, Command, main
+from manip_il.cli.main import COMMANDS, main
 
 from . import fake_command
 
@@ -15,7 +15,7 @@ from . import fake_command
 def fake(monkeypatch):
     for package in ("manip_il.cli", "manip_il.cli.run"):
         monkeypatch.setitem(sys.modules, f"{package}.fake_command", fake_command)
-    monkeypatch.setitem(COMMANDS, "fake", Command("fake_command:FakeOptions", "do what the tests ask"))
+    monkeypatch.setitem(COMMANDS, "fake", ("fake_command:FakeOptions", "do what the tests ask"))
 
 
 def test_the_module_runs_as_a_program():

@@ -84,7 +84,6 @@ MISTAKES = {
     "record --cameras=front --image.height=127": "pictures have height 127 and width 128; expected even numbers",
     "record --dataset.repo_id=../name": "expected a name of letters",
     "dagger --config_path=missing.yaml": "cannot read missing.yaml",
-    "dagger --config_path=a.yaml --config_path=b.yaml": "--config_path is given twice",
     "dagger --beta=lineal:5": "beta is 'lineal:5'; expected constant:B, linear:ROUNDS",
     "dagger --rounds=-1": "rounds is -1; expected 0 to 99",
     "dagger --hold=-1": "hold is -1; expected at least 0",

@@ -33,23 +33,23 @@ def ours(tmp_path):
 
 
 def overwrite(folder: Path, kind: str = EVALUATION) -> None:
-    prepare_output(folder, kind, overwrite=True)
+    prepare_output({folder: kind}, overwrite=True)
 
 
 def test_a_new_or_empty_folder_is_fine_and_a_full_one_is_refused_with_the_ways_on(ours, tmp_path):
-    prepare_output(tmp_path / "new", EVALUATION)
-    prepare_output(tmp_path / "new", EVALUATION, resume=True)
+    prepare_output({tmp_path / "new": EVALUATION})
+    prepare_output({tmp_path / "new": EVALUATION}, resume=True)
     (tmp_path / "empty").mkdir()
-    prepare_output(tmp_path / "empty", EVALUATION)
+    prepare_output({tmp_path / "empty": EVALUATION})
     with pytest.raises(FolderExistsError, match=r"--resume=true.*--overwrite=true"):
-        prepare_output(ours, EVALUATION)
+        prepare_output({ours: EVALUATION})
     with pytest.raises(UsageError, match="contradict"):
-        prepare_output(ours, EVALUATION, resume=True, overwrite=True)
+        prepare_output({ours: EVALUATION}, resume=True, overwrite=True)
 
 
 def test_resume_removes_what_a_killed_writer_left_of_a_file(ours):
     (ours / ".fingerprint.json.x.partial").touch()
-    prepare_output(ours, EVALUATION, resume=True)
+    prepare_output({ours: EVALUATION}, resume=True)
     assert [path.name for path in ours.iterdir()] == ["config.yaml"]
 
 
@@ -94,11 +94,11 @@ def test_overwrite_replaces_a_single_file_only_if_it_names_this_program(tmp_path
     path = tmp_path / name
     path.write_bytes(b"years of work")
     with pytest.raises(UsageError, match="does not say that manip-il wrote it"):
-        OutputFile(path, overwrite=True).check()
+        OutputFile(output=path, overwrite=True).check()
     path.write_bytes(b'\x08{"format": "manip_il pairs"}')
-    OutputFile(path, overwrite=True).check()
+    OutputFile(output=path, overwrite=True).check()
     with pytest.raises(UsageError, match="--overwrite=true"):
-        OutputFile(path).check()
+        OutputFile(output=path).check()
 
 
 def test_an_evaluation_does_not_replace_a_dataset(tmp_path):
@@ -124,7 +124,7 @@ def test_overwrite_spares_what_is_read_and_follows_no_link(ours, tmp_path):
         overwrite(tmp_path / "link")
     assert (ours / "config.yaml").is_file()
     with pytest.raises(UsageError, match="overlaps"):
-        prepare_output(ours, EVALUATION, overwrite=True, sources=[ours / "inside"])
+        prepare_output({ours: EVALUATION}, overwrite=True, sources=[ours / "inside"])
     (ours / "dagger").mkdir()
     assert main(["theory", str(ours / "dagger"), f"--output_dir={ours}", "--overwrite=true"]) == 2
     assert main(["data", "build", str(ours), str(ours), "--overwrite=true"]) == 2
@@ -151,7 +151,7 @@ def test_a_folder_that_is_in_use_is_refused(how, here, error):
 
 
 def test_a_resumed_run_may_have_more_steps_but_no_fewer(tmp_path):
-    save_options(tmp_path, resumed := TrainOptions(SourceGroup([tmp_path]), fit={"steps": 4}))
+    save_options(tmp_path, resumed := TrainOptions(dataset=SourceGroup([tmp_path]), fit={"steps": 4}))
     check_same_options(tmp_path, replace(resumed, fit={"steps": 8}))
     for other in ({"steps": 2}, {}):
         with pytest.raises(MismatchError, match="--steps"):

@@ -192,7 +192,7 @@ def test_a_stored_path_is_a_bad_name(command, field, given_files, capsys):
 def test_python_says_that_a_policy_of_ones_own_files_needs_them(field, given_files):
     with hostile(given_files, field), nothing_is_touched(), pytest.raises(ManipError) as caught:
         manip_il.evaluate(given_files / "policy", episodes=1)
-    assert field == "object" or "give env=make_config(" in str(caught.value)
+    assert field == "object" or "of a file of your own; give --" in str(caught.value)
 
 
 @pytest.mark.parametrize("words", ["data check DATA", "train --dataset.root=DATA --steps=1 --output_dir=new"])

@@ -46,7 +46,7 @@ def runs(policy, monkeypatch) -> list[DaggerOptions]:
     def run(options: DaggerOptions) -> None:
         asked.append(options)
         successes = (0.2, 0.4, 0.6) if options.method == "dagger" else (0.2, 0.2, 0.4)
-        make_run(options.output.output_dir, policy, options.settings["seed"], successes)
+        make_run(options.output_dir, policy, options.settings["seed"], successes)
 
     monkeypatch.setattr("manip_il.cli.run.compare.run_dagger", run)
     return asked
@@ -60,11 +60,9 @@ def test_every_arm_runs_with_every_training_seed_and_its_own_options(here, runs)
     assert study() == 0
     expected = [(seed, method) for seed in range(2) for method in ("cloning", "dagger")]
     assert [(options.settings["seed"], options.method) for options in runs] == expected
-    assert [str(options.output.output_dir) for options in runs] == [
-        f"s/{method}/seed_{seed}" for seed, method in expected
-    ]
+    assert [str(options.output_dir) for options in runs] == [f"s/{method}/seed_{seed}" for seed, method in expected]
     assert all(options.env["horizon"] == 8 and options.fit["policy"] == {"width": 16} for options in runs)
-    assert all(options.output.resume and options.engine.workers == 1 for options in runs)
+    assert all(options.resume and options.workers == 1 for options in runs)
 
 
 def test_the_answer_is_printed_and_written(here, runs, capsys):
@@ -89,10 +87,10 @@ def test_finished_runs_and_evaluations_are_not_made_again(here, runs, evaluated)
     for path in (here / "s" / "dagger" / "seed_1").iterdir():
         path.rename(here / path.name)
     assert study("--resume=true") == 0
-    assert [str(options.output.output_dir) for options in runs[4:]] == ["s/dagger/seed_1"]
+    assert [str(options.output_dir) for options in runs[4:]] == ["s/dagger/seed_1"]
     assert len(evaluated) == 4  # its policies came out the same
     assert study("--resume=true", "--training_seeds=3") == 0
-    assert [str(options.output.output_dir) for options in runs[5:]] == ["s/cloning/seed_2", "s/dagger/seed_2"]
+    assert [str(options.output_dir) for options in runs[5:]] == ["s/cloning/seed_2", "s/dagger/seed_2"]
     assert evaluated[4:] == ["s/cloning/seed_2", "s/dagger/seed_2"]
 
 

@@ -15,10 +15,10 @@ from manip_il.cli.options import options_of
 from manip_il.cli.parsing import dump_yaml, parse
 from manip_il.cli.run.compare import read_plan
 from manip_il.cli.run.dagger import dagger_config
-from manip_il.cli.run.train import fit_config
 from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.policy_folder import find_policy
+from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options
+from manip_il.learn.policy_folder import find_policy, with_folder
 
 from ..damage import edit_json
 from .made_runs import make_eval, make_policy, make_run
@@ -66,7 +66,7 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, pol
         assert main(command) == 1
         assert re.search(r"evil/x.*add --trust=true", error())
     with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
-        lerobot_options(fit_config(parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"])))
+        lerobot_options(FitConfig({"path": str(named)}))
     assert not (tmp_path / "out").exists()
 
 
@@ -119,5 +119,5 @@ def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, 
     run = make_run(here / "run", policy)
     task = ["--task.type=reach"] if command == "dagger" else []
     options = parse(load(command), [*REQUIRED.get(command, []), *task, "--policy.path=run"])
-    fit = dagger_config(options).fit if command == "dagger" else fit_config(options)
+    fit = dagger_config(options).fit if command == "dagger" else FitConfig(with_folder(options.fit["policy"]))
     assert Path(lerobot_options(fit)[0].policy.pretrained_path).resolve() == find_policy(run).resolve()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -57,7 +56,7 @@ def turn(seed: int = 0, step: int = 0, value: float = 0.0, teacher: Teacher | No
 
 @pytest.mark.parametrize("beta", [0.0, 0.2, 1.0])
 def test_a_mixture_executes_the_label_with_probability_beta_else_the_learners_action(beta: float):
-    driver = PolicyDriver((Path("x"),), beta).start(setting(Diary(0.0, 0.0, 0.0)))
+    driver = PolicyDriver(beta=beta).start(setting(Diary(0.0, 0.0, 0.0)))
     turns = [turn(seed, step=1, teacher=Teacher(1.0, 1.0, 1.0)) for seed in range(20)]
     chosen = [one for _ in range(50) for one in driver(turns)]
     assert all(action[0] == (actor == Actor.EXPERT) for action, actor in chosen)
@@ -79,7 +78,7 @@ def test_a_random_driver_stays_within_its_reach():
 
 def test_a_learner_is_told_whose_turn_it_is_and_of_what_and_sees_the_pictures_of_its_cameras():
     diary = Diary(0.0, 0.0, 0.0)
-    driver = PolicyDriver((Path("x"),)).start(setting(diary))
+    driver = PolicyDriver().start(setting(diary))
     for step in ([turn(10, 0), turn(20, 4)], [turn(10, 1), turn(20, 0)], [turn(10, 2)]):
         driver(step)
     assert diary.notes == [

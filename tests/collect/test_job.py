@@ -44,7 +44,7 @@ JOBS = {
 
 @pytest.fixture
 def job(checkpoint: Path) -> RolloutJob:
-    return RolloutJob(ENV, PolicyDriver((checkpoint,)))
+    return RolloutJob(ENV, PolicyDriver.of(checkpoint))
 
 
 def run(job: RolloutJob, seeds=SEEDS) -> dict[int, Episode]:
@@ -68,7 +68,7 @@ def is_the_experts(episode: Episode) -> None:
 def test_labels_are_the_experts_and_an_episode_depends_on_its_seed_alone(job: RolloutJob, name: str, tmp_path: Path):
     changes = dict(JOBS[name])
     if name == "policy of chunks":  # whose memory could leak from one episode into another
-        changes["driver"] = PolicyDriver((write_checkpoint(tmp_path / "act", "act", env_spec(ENV)),))
+        changes["driver"] = PolicyDriver.of(write_checkpoint(tmp_path / "act", "act", env_spec(ENV)))
     elif name == "mixture":
         changes = {"driver": replace(job.driver, **changes)}
     job = replace(job, **changes)

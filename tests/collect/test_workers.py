@@ -96,7 +96,7 @@ def test_an_episode_is_on_disk_before_it_arrives_with_the_bytes_of_one_process(e
 @pytest.mark.slow
 @both_backends
 def test_a_policy_acts_the_same_everywhere(engine: Engine, checkpoint):
-    job = RolloutJob(make_config(horizon=10), PolicyDriver((checkpoint,), 0.5))
+    job = RolloutJob(make_config(horizon=10), PolicyDriver.of(checkpoint, beta=0.5))
     assert written(engine.run(job, SEEDS[:4])) == written(job.run(SEEDS[:4]))
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from manip_il.cli.main import COMMANDS, load
+from manip_il.cli.main import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (
@@ -99,9 +99,10 @@ def page_lines(page: str) -> list[Line]:
 
 def help_lines() -> list[Line]:
     """The example in the help of every command, and that of `manip-il --help`."""
-    from manip_il.cli.main import _help
+    from manip_il.cli.main import _help, load
 
-    examples = {f"{name} --help": load(name).example for name in COMMANDS}
+    texts = {name: str(load(name).__doc__).rpartition("Example: ")[2] for name in COMMANDS}
+    examples = {f"{name} --help": " ".join(text.split()) for name, text in texts.items()}
     first = _help().rpartition("example: ")[2]
     assert first in examples.values(), f"manip-il --help: {first!r} is not the example of its command"
     return [Line(f"manip-il {name}", tuple(shlex.split(text))) for name, text in examples.items()]

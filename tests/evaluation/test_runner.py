@@ -39,7 +39,7 @@ def mlp(tmp_path_factory):
 
 
 def job_of(policy, **changes) -> RolloutJob:
-    return RolloutJob(ENV, PolicyDriver((policy,)), label="last", **changes)
+    return RolloutJob(ENV, PolicyDriver.of(policy), label="last", **changes)
 
 
 @pytest.mark.slow

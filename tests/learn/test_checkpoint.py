@@ -147,7 +147,7 @@ def test_a_worker_trusts_only_what_its_job_does(act, ran):
     edit_config(act, input_features={"observation.state": {"type": "STATE", "shape": [8]}})
     edit_config(act, output_features={"action": {"type": "ACTION", "shape": [8]}})
     (act / "manip_il.json").unlink()
-    job = RolloutJob(make_config("panda", "reach", horizon=8), PolicyDriver((act,)), label="last")
+    job = RolloutJob(make_config("panda", "reach", horizon=8), PolicyDriver.of(act), label="last")
     with pytest.raises(ManipError, match="--trust=true"):
         list(pickle.loads(pickle.dumps(job)).run([0]))
     assert ran == []

@@ -87,7 +87,7 @@ class Trial:
         self, policy: Path, on_episode: Callable[[Episode], None] = lambda episode: None
     ) -> tuple[EpisodeResult, ...]:
         """By this project's own evaluation."""
-        job = RolloutJob(self.env, PolicyDriver((policy,)), cameras=self.cameras)
+        job = RolloutJob(self.env, PolicyDriver.of(policy), cameras=self.cameras)
         found: dict[int, EpisodeResult] = {}
         with Engine(workers=1) as engine:
             for episode in engine.run(job, self.seeds):

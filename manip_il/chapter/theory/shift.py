@@ -127,7 +127,7 @@ def measure_shift(
     plain = RolloutJob(env, hold=0, conditions=conditions)
     expert, expert_cost, _ = _run(engine, plain, seeds, on_episode)
     for number, path, datasets in rounds:
-        own, cost, success = _run(engine, replace(plain, driver=PolicyDriver((path,))), seeds, on_episode)
+        own, cost, success = _run(engine, replace(plain, driver=PolicyDriver.of(path)), seeds, on_episode)
         policy = LearnedPolicy.load(path)
         data = joined_columns(datasets, [schema.ENVIRONMENT_STATE])[schema.ENVIRONMENT_STATE]
         wrong = _is_wrong(own[schema.EXECUTED_ACTION], own, scale)

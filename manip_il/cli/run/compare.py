@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from manip_il import checks
+from manip_il.algorithms.config import check_labels
+from manip_il.algorithms.imitation import check_inputs
 from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.compare import CompareOptions, ComparisonOptions, StudyFile
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.outputs import REPORT_FILE, ResumableOutput, publish
+from manip_il.cli.outputs import REPORT_FILE, publish
 from manip_il.cli.parsing import from_layers, from_yaml
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.cli.run.dagger import dagger_config, run_dagger
-from manip_il.cli.run.inputs import check_policy, env_config
+from manip_il.collect.inputs import env_config
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.evaluation.comparison import FILE_NAME, Study
 from manip_il.evaluation.eval_report import compare_report
+from manip_il.evaluation.measuring import measure_sides
 from manip_il.evaluation.rounds import Rule
-from manip_il.evaluation.runner import Trial
 from manip_il.evaluation.side import Side, read_side, require_pair, require_same_env, select_rounds
 from manip_il.learn.checkpoint import Checkpoint
-from manip_il.seeding import stream_seeds
 from manip_il.worlds.config import EnvConfig
 
 _YAML = (".yaml", ".yml")
@@ -53,32 +54,62 @@ def _refuse(options: CompareOptions, why: str, *names: str) -> None:
 
 def _run_study(options: CompareOptions, path: Path) -> None:
     plan = read_plan(path, options.training_seeds, options.trust)
-    file = plan.file
-    with options.output.open(file, path) as folder:
-        run_plan(plan, folder, options.engine)
-        rule, sides = select_rounds(
-            Rule(file.checkpoint, file.at), [read_side(folder / name, name) for name in plan.arms]
-        )
-        trials = _trials(options, sides, plan.envs, file.eval.n_episodes)
-        _report(options, sides, trials, folder, (plan.baseline, rule, file.target), f"Study: {path.stem}", file)
+    with options.open(path, saved=plan.file) as folder:
+        run_plan(plan, folder, options)
+        sides = [read_side(folder / name, name) for name in plan.arms]
+        title = f"Study: {path.stem}"
+        _finish(options, plan.file, sides, plan.envs, plan.baseline, title, target=plan.file.target)
 
 
 def _compare(options: CompareOptions, left: Path, right: Path) -> None:
     both = (read_side(left), read_side(right))
     require_pair(*both)
-    rule, both = select_rounds(Rule(options.checkpoint, options.at), both)
     first, *others = [member for side in both for member in side.members]
-    trials: Sequence[Trial] = ()
+    envs = dict[str, EnvConfig]()
     if first.result:
         _refuse(options, "change nothing for two evaluations; give two policies", "eval", "env", "suite", "seed")
-        Study(both, both[0].name)  # raises unless they can be compared
         for other in others:
             warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
     else:
         envs = dict.fromkeys((side.name for side in both), _env(options, both))
-        trials = _trials(options, both, envs, options.eval.n_episodes)
-    with options.output.open(options) as folder:
-        _report(options, both, trials, folder, (both[0].name, rule), f"{left} against {right}", options)
+    with options.lock() as prepare:
+        _finish(options, options, both, envs, both[0].name, f"{left} against {right}", prepare)
+
+
+def _finish(
+    options: CompareOptions,
+    how: ComparisonOptions,
+    sides: Sequence[Side],
+    envs: Mapping[str, EnvConfig],
+    baseline: str | None,
+    title: str,
+    prepare: Callable[[], None] | None = None,
+    **target: float,
+) -> None:
+    """Run the tests, write the result and the report, print the table and the verdict.
+
+    how: the options to store. envs: of each side; none if the sides are evaluations.
+    """
+    folder = options.output_dir
+    rule, sides = select_rounds(Rule(how.checkpoint, how.at), sides)
+    with Stages(f"every finished episode, in {folder}", prepare) as stages, options.open_engine() as engine:
+        if envs:
+            sides = measure_sides(
+                sides,
+                envs,
+                folder,
+                episodes=how.eval.n_episodes,
+                suite=options.suite,
+                seed=options.seed,
+                trust=options.trust,
+                engine=engine,
+                progress=stages,
+            )
+        study = Study(sides, baseline, rule, **target)
+        if not envs:
+            stages.started()
+    page = compare_report(study, title)
+    publish(folder / FILE_NAME, study.to_json(), [study.table()], study.verdict, *study.facts, page=page, options=how)
 
 
 def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
@@ -90,43 +121,6 @@ def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
         return require_same_env({run.name: replace(run.validation.env(*own), **given) for run in runs})
     origins = {one.name: Checkpoint.open(one.policy).origin for one in members if one.policy is not None}
     return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
-
-
-def _trials(
-    options: CompareOptions, sides: Sequence[Side], envs: Mapping[str, EnvConfig], n_episodes: int
-) -> list[Trial]:
-    """Return the test of each side; raises, before any episode runs, if a policy does not fit its environment."""
-    policies = list[Path]()
-    for side in sides:
-        for policy in side.policies:
-            check_policy(Checkpoint.open(policy), envs[side.name], trust=options.trust)
-            policies.append(policy)
-    seeds = stream_seeds("test", n_episodes, options.seed)
-    return [Trial.of(envs[side.name], seeds, options.suite, policies, options.trust) for side in sides]
-
-
-def _report(
-    options: CompareOptions,
-    sides: Sequence[Side],
-    trials: Sequence[Trial],
-    folder: Path,
-    how: tuple[Any, ...],
-    title: str,
-    config: ComparisonOptions,
-) -> None:
-    """Run the tests, write the result and the report, print the tables and the verdict.
-
-    trials: of each side; none if they are evaluations. how: what `Study` takes after its sides.
-    """
-    if trials:
-        with Stages(f"every finished episode, in {folder}") as stages, options.engine.open() as engine:
-            pairs = zip(sides, trials, strict=True)
-            sides = [side.measure(trial, folder, engine, stages) for side, trial in pairs]
-    study = Study(tuple(sides), *how)
-    page = compare_report(study, title)
-    publish(
-        folder / FILE_NAME, study.to_json(), [study.table()], study.verdict, *study.facts, page=page, options=config
-    )
 
 
 class StudyPlan(NamedTuple):
@@ -142,11 +136,20 @@ def run_plan(plan: StudyPlan, root: Path, engine: EngineOptions) -> None:
     """Run the missing runs, seed by seed, so that a study that is stopped early has runs of every arm."""
     runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
     for number, (name, seed) in enumerate(runs, start=1):
-        output = ResumableOutput(root / name / f"seed_{seed}", resume=True)
-        if not (output.output_dir / REPORT_FILE).is_file():  # the file that a run writes last
+        output = root / name / f"seed_{seed}"
+        if not (output / REPORT_FILE).is_file():  # the file that a run writes last
             say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
             arm = plan.arms[name]
-            run_dagger(replace(arm, settings=arm.settings | {"seed": seed}, output=output, engine=engine))
+            run_dagger(
+                replace(
+                    arm,
+                    settings=arm.settings | {"seed": seed},
+                    output_dir=output,
+                    resume=True,
+                    workers=engine.workers,
+                    engine=engine.engine,
+                )
+            )
 
 
 def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False) -> StudyPlan:
@@ -166,12 +169,15 @@ def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False
             if found := next((one for one in _OF_STUDY for _, tree in layers if one in (tree or {})), None):
                 raise UsageError(f"{found} is set by the study for every run; remove it")
             arms[name] = replace(from_layers(DaggerOptions, layers), trust=trust)
-            envs[name] = dagger_config(arms[name]).env
+            config = dagger_config(arms[name])
+            check_labels(config)
+            check_inputs(config)
+            envs[name] = config.env
         except ManipError as error:
             raise UsageError(f"{path}: arm {name!r}: {error}") from error
+    if file.baseline is not None and file.baseline not in envs:
+        raise UnknownName("baseline", file.baseline, envs)
     if file.baseline is None and len({env.task for env in envs.values()}) > 1:
         return StudyPlan(file, arms, envs, None)
     require_same_env(envs)
-    if file.baseline is not None and file.baseline not in envs:
-        raise UnknownName("baseline", file.baseline, envs)
     return StudyPlan(file, arms, envs, file.baseline or next(iter(envs)))

@@ -8,7 +8,7 @@ from manip_il.bridges.doctor.examine import examine_folder, repair
 from manip_il.bridges.doctor.files import Finding, warning
 from manip_il.cli.data_check import CheckOptions, RepairOptions
 from manip_il.cli.progress import say
-from manip_il.cli.run.inputs import differences
+from manip_il.collect.inputs import differences
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import OURS
 from manip_il.errors import ManipError

@@ -6,16 +6,16 @@ from manip_il.cli.progress import say
 from manip_il.cli.transfer import ExportOptions
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError
-from manip_il.evaluation.policy_folder import find_policy
 from manip_il.learn.checkpoint import read_config
 from manip_il.learn.export import export_onnx
+from manip_il.learn.policy_folder import find_policy
 
 EXPORTABLE = ("mlp", "cnn")
 
 
 def run_export(options: ExportOptions) -> None:
     """Export, compare, write."""
-    options.file.check()
+    options.check()
     path = find_policy(options.policy)
     if (kind := read_config(path)["type"]) not in EXPORTABLE:
         raise ManipError(f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported")
@@ -23,6 +23,6 @@ def run_export(options: ExportOptions) -> None:
         content, difference = export_onnx(path)
     except ImportError as error:
         raise ManipError(f"an ONNX file needs {error.name}: pip install 'manip_il[export]'") from error
-    write_file(options.file.output, content)
+    write_file(options.output, content)
     say(f"largest difference from {path} over random observations: {difference:.1e}")
-    say(f"exported: {options.file.output} ({len(content):,} bytes)")
+    say(f"exported: {options.output} ({len(content):,} bytes)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from manip_il.chapter import inverse
 from manip_il.chapter.inverse import learn
 from manip_il.cli.outputs import publish
-from manip_il.cli.progress import progress, say_next
+from manip_il.cli.progress import progress
 from manip_il.cli.reward import IrlOptions
 from manip_il.seeding import rng_for, stream_base
 
@@ -17,7 +17,6 @@ def run_irl(options: IrlOptions) -> None:
     rng = rng_for(stream_base("training", options.seed), "irl")
     learnt = learn(options.method, [one.demonstration for one in carried], rng)
     found = inverse.Inverse(str(options.dataset), tuple(carried), learnt)
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         page = inverse.inverse_report(found)
         publish(folder / inverse.FILE_NAME, found.to_json(), [inverse.weight_table(found)], page=page, options=options)
-    say_next("eval", "--policy.type=expert", f"--task.type=carry:{folder / inverse.FILE_NAME}")

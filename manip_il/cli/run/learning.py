@@ -2,40 +2,44 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
-from manip_il.algorithms.results import Watch, learning_report, validations
+from manip_il.algorithms.results import validation_report, validations
 from manip_il.chapter.config import LearningConfig
 from manip_il.chapter.learning import LearningRun
 from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.learning import GailOptions, Learning, PpoOptions
-from manip_il.cli.outputs import REPORT_FILE, write_page
+from manip_il.cli.outputs import REPORT_FILE, about
 from manip_il.cli.progress import Stages, say
 from manip_il.cli.run.dagger import say_best
-from manip_il.cli.run.inputs import open_datasets
+from manip_il.collect.inputs import open_dataset
 from manip_il.data.json_lines import read_lines
-from manip_il.evaluation.policy_folder import find_policy
 from manip_il.evaluation.rounds import METRICS_FILE
 from manip_il.learn.checkpoint import Origin
+from manip_il.learn.policy_folder import find_policy
+from manip_il.learn.sources import check_same_sources
+from manip_il.progress import Progress
 from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.worlds.table import env_spec, stored_config
 
 
 def _run(options: Learning, config: LearningConfig) -> None:
     """Run all iterations, or continue them, and write the report."""
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         kept = f"every finished iteration, in {folder}"
-        with Stages(kept) as stages, options.engine.open() as engine:
-            watch = Watch(on_episode=lambda _: stages.check(), on_step=stages.check)
+        with Stages(kept) as stages, options.open_engine() as engine:
+            watch = Progress()
+            vars(watch).update(dict.fromkeys(("episode", "step"), lambda *_: stages.check()))
             stages.start(f"{options.method.upper()}, steps", config.steps)
             for result in LearningRun(config, folder, engine, watch).results():
                 stages.log({"step": result.steps} | result.metrics)
                 if result.validated is not None:
                     say(f"{result.steps:,} steps: validation success {result.validated.success}")
-        title, found = f"{options.method.upper()} on {config.env.robot} {config.env.task}", validations(folder)
-        page = learning_report(title, found, read_lines(folder / METRICS_FILE))
-        write_page(page, folder / REPORT_FILE, options)
-    say_best(folder, config.env)
+        title = f"{options.method.upper()} on {config.env.robot} {config.env.task}"
+        page = validation_report(title, "initial policy", validations(folder), read_lines(folder / METRICS_FILE))
+        replace(page, **about(options)).write(folder / REPORT_FILE)
+    say_best(folder)
 
 
 def _config(options: Learning, spec: EnvironmentSpec | Origin, **more: Any) -> LearningConfig:
@@ -63,5 +67,7 @@ def run_ppo(options: PpoOptions) -> None:
 
 def imitation_config(options: GailOptions) -> LearningConfig:
     """Return the configuration of the run; raises if the demonstrations are not of one known environment."""
-    first, *_ = open_datasets(options.dataset.root, pictures=False)
-    return _config(options, first.spec, datasets=tuple(options.dataset.root), discriminator=options.discriminator)
+    roots = options.dataset.root
+    specs = [open_dataset(root).spec for root in roots]
+    check_same_sources(roots, specs, pictures=False, language=False)
+    return _config(options, specs[0], datasets=tuple(roots), discriminator=options.discriminator)

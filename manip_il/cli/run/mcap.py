@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from manip_il.bridges.mcap.export import MAPPING, export_dataset, left_out
+from manip_il.bridges.mcap.export import export_dataset, left_out
 from manip_il.bridges.mcap.importing import import_files, list_files
 from manip_il.bridges.mcap.mapping import load_mapping
-from manip_il.cli.outputs import kind_of_output, prepare_output, save_options
-from manip_il.cli.progress import progress, say, say_next
+from manip_il.cli.outputs import prepare_output, save_options
+from manip_il.cli.progress import progress, say
 from manip_il.cli.transfer import McapExportOptions, McapImportOptions
 from manip_il.data.atomic import new_folder
 from manip_il.data.dataset import Dataset
+from manip_il.data.ownership import output_of
 
 
 def run_mcap_export(options: McapExportOptions) -> None:
     """Export every episode; the folder appears when it is complete."""
     dataset = Dataset.open(options.dataset)
-    prepare_output(options.out, kind_of_output(options), overwrite=options.overwrite, sources=[options.dataset])
+    prepare_output({options.out: output_of("McapExport")}, overwrite=options.overwrite, sources=[options.dataset])
     with new_folder(options.out) as folder, progress(dataset.info.episodes, "export") as bar:
         for _ in export_dataset(dataset, folder):
             bar.step()
@@ -23,7 +24,6 @@ def run_mcap_export(options: McapExportOptions) -> None:
     if missing := left_out(dataset.info):
         say(f"left out, because MCAP cannot hold them: {', '.join(missing)}")
     say(f"exported {dataset.info.episodes:,} episodes to {options.out}")
-    say_next("data", "from-mcap", options.out, "DATASET", f"--mapping={options.out / MAPPING}", what="to convert back")
 
 
 def run_mcap_import(options: McapImportOptions) -> None:

@@ -16,52 +16,44 @@ from manip_il.chapter.preferences.pairs import (
     read_clips,
 )
 from manip_il.chapter.reward import LearnedReward, shape_for, write_reward
-from manip_il.cli.progress import progress, say, say_next
-from manip_il.cli.reward import AnswerOptions, AskOptions, FitOptions, OfPairs, PairsOptions
+from manip_il.cli.progress import progress, say
+from manip_il.cli.reward import AnswerOptions, AskOptions, FitOptions, PairsOptions
 from manip_il.data.atomic import write_file, write_json
 from manip_il.data.dataset import Dataset
-from manip_il.evaluation.policy_folder import find_policy
+from manip_il.learn.policy_folder import find_policy
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.seeding import rng_for, stream_base
 
 
-def sources_option(options: OfPairs | PairsOptions) -> str:
-    """Return the option that names the sources again, for the next command."""
-    return f"--sources={','.join(map(str, options.sources))}"
-
-
 def run_pairs(options: PairsOptions) -> None:
     """Read the sources, choose, and write the pairs."""
-    options.file.check()
+    options.check()
     reward = LearnedReward.load(find_policy(options.reward)) if options.reward else None
     rng = rng_for(stream_base("training", options.seed), "pairs")
     clips = choose_pairs(find_datasets(options.sources), options.clip, options.count, options.seed, rng, reward)
-    write_json(options.file.output, clips.pairs.to_json())
-    say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {options.file.output}")
-    say_next("reward", "ask", options.file.output, sources_option(options), "--output=ask.html")
+    write_json(options.output, clips.pairs.to_json())
+    say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {options.output}")
 
 
 def run_ask(options: AskOptions) -> None:
     """Render the films and write the page."""
-    options.file.check()
+    options.check()
     clips = read_clips(Pairs.read(options.pairs), find_datasets(options.sources))
     with progress(len(clips.pairs), "render") as bar:
         films = render_films(clips, options.robot, bar.step)
     page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
-    write_file(options.file.output, page.encode())
-    say(f"{len(clips.pairs):,} pairs: {options.file.output}")
-    say_next("reward", "fit", options.pairs, "preferences.json", sources_option(options), "--output_dir=runs/reward")
+    write_file(options.output, page.encode())
+    say(f"{len(clips.pairs):,} pairs: {options.output}")
 
 
 def run_answer(options: AnswerOptions) -> None:
     """Compare every pair and write the answers."""
-    options.file.check()
+    options.check()
     teacher = Teacher.parse(options.teacher)
     clips = read_clips(Pairs.read(options.pairs), find_datasets(options.sources))
     rng = rng_for(stream_base("training", options.seed), "teacher")
-    write_json(options.file.output, answer_pairs(teacher, clips, rng).to_json())
-    say(f"{len(clips.pairs):,} answers: {options.file.output}")
-    say_next("reward", "fit", options.pairs, options.file.output, sources_option(options), "--output_dir=runs/reward")
+    write_json(options.output, answer_pairs(teacher, clips, rng).to_json())
+    say(f"{len(clips.pairs):,} answers: {options.output}")
 
 
 def run_fit(options: FitOptions) -> None:
@@ -74,10 +66,9 @@ def run_fit(options: FitOptions) -> None:
         found = fit_answers(clips, answers, shape, stream_base("training", options.seed), bar.step)
     fingerprint = Dataset.open(clips.roots[0]).fingerprint
     stored = {"seed": options.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.clip}
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         target = folder / PRETRAINED_MODEL
         target.mkdir(parents=True, exist_ok=True)
         write_reward(target, found.network, clips.frames[0].spec, stored, fingerprint)
         write_json(folder / "fit.json", found.to_json())
-    say(*summary_lines(found, answers))
-    say_next("data", "score", "DATASET", f"--reward={folder}", "--output_dir=runs/scores")
+    say(*summary_lines(found, answers), f"reward: {folder}")

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 from manip_il import checks
-from manip_il.cli.outputs import OutputFile, publish, write_page
-from manip_il.cli.progress import progress, say, say_next
+from manip_il.cli.outputs import OutputFile, about, publish
+from manip_il.cli.progress import progress, say
 from manip_il.cli.robot import CertifyOptions, RobotCheckOptions, RobotNewOptions
-from manip_il.cli.run.inputs import env_config
+from manip_il.collect.inputs import env_config
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_file, write_json
 from manip_il.errors import ManipError
 from manip_il.evaluation import robot_check
 from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
 from manip_il.evaluation.robot_check import advice, check_robot, verdict
-from manip_il.evaluation.tables import print_table
 from manip_il.robots.gripper import sweep
 from manip_il.robots.suggest import suggest, yaml_of
 from manip_il.robots.table import get_robot
@@ -29,7 +29,7 @@ def run_robot_new(options: RobotNewOptions) -> None:
     """Write the YAML file, check the robot, print what is left to do. Raises `ManipError` if it can do no task."""
     target = options.output or options.model.with_suffix(".yaml")
     checks.name(f"the name of {target}, which becomes the robot's,", target.stem)
-    OutputFile(target, overwrite=options.overwrite).check()
+    OutputFile(output=target, overwrite=options.overwrite).check()
     paths = [os.path.relpath(path, target.parent) if path else "" for path in (options.model, options.gripper)]
     found = suggest(options.model, options.gripper)
     write_file(target, yaml_of(found, *paths).encode())
@@ -39,7 +39,6 @@ def run_robot_new(options: RobotNewOptions) -> None:
     say(verdict(checked), *(f"change: {line}" for line in advice(checked)))
     if len(checked.failed) == len(NAMES):
         raise ManipError(f"{target} cannot do any task yet; see above")
-    say_next("view", f"--robot.type={target}", "--task.type=pick_place", what="look at the robot")
 
 
 def run_robot_check(options: RobotCheckOptions) -> None:
@@ -48,12 +47,12 @@ def run_robot_check(options: RobotCheckOptions) -> None:
     tasks = options.tasks or list(NAMES)
     for task in tasks:
         get_task(task)
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         with progress(2 * options.episodes * len(tasks), f"check {options.robot}") as bar, Engine(None) as engine:
             found = robot_check.check_robot(options.robot, tasks, options.episodes, engine, lambda _: bar.step())
         write_json(folder / robot_check.FILE_NAME, found.to_json())
-        write_page(robot_check.check_report(found), folder / PAGE, options)
-    print_table(robot_check.task_table(found))
+        replace(robot_check.check_report(found), **about(options)).write(folder / PAGE)
+    robot_check.task_table(found).print()
     say(robot_check.verdict(found), *(f"change: {line}" for line in robot_check.advice(found)))
     say(f"page: {folder / PAGE}")
     if found.failed:
@@ -64,9 +63,9 @@ def run_robot_check(options: RobotCheckOptions) -> None:
 def run_certify(options: CertifyOptions) -> None:
     """Run the episodes, write `certificate.json`, print the tables."""
     env = env_config(options.env)
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         count = count_episodes(env, options.cases)
-        with progress(count, f"certify {env.robot} {env.task}") as bar, options.engine.open() as engine:
+        with progress(count, f"certify {env.robot} {env.task}") as bar, options.open_engine() as engine:
             certificate = certify(engine, env, options.cases, options.seed, lambda _: bar.step())
         mu = certificate.mu
         lines = () if mu is None else (f"u of Ross et al. (2011) is at least {mu} steps",)

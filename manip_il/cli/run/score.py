@@ -10,7 +10,7 @@ from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.data_check import ScoreOptions
 from manip_il.cli.outputs import publish
 from manip_il.errors import ManipError
-from manip_il.evaluation.policy_folder import find_policy
+from manip_il.learn.policy_folder import find_policy
 
 PROGRESS = "progress"  # value of --reward: score by true progress
 
@@ -27,7 +27,7 @@ def run_score(options: ScoreOptions) -> None:
     else:
         raise ManipError(f"{options.dataset} has no progress column; give --reward=FOLDER")
     scores = scoring.Scores(str(options.dataset), options.reward, data, found)
-    with options.output.open(options, Path(options.reward).expanduser()) as folder:
+    with options.open(Path(options.reward).expanduser()) as folder:
         scoring.write_weights(folder / scoring.WEIGHTS_FILE, scores)
         worst = [scoring.worst_table(scores)]
         publish(folder / scoring.FILE_NAME, scores.to_json(), worst, *scoring.fact_lines(scores))

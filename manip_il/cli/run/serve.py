@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from manip_il.cli.outputs import kind_of_output, save_options
+from manip_il.cli.outputs import save_options
 from manip_il.cli.progress import say
-from manip_il.cli.run.inputs import open_driver
 from manip_il.cli.serve import ServeOptions
 from manip_il.data.atomic import exclusive
-from manip_il.data.ownership import require_ours
-from manip_il.errors import UnknownName, UsageError
-from manip_il.evaluation.policy_folder import find_policy
+from manip_il.data.ownership import output_of, require_ours
+from manip_il.errors import UsageError
+from manip_il.evaluation.measuring import open_driver
 from manip_il.evaluation.suites import varied
+from manip_il.learn.policy_folder import find_policy
 from manip_il.serve.config import LEADERS, SessionConfig
 from manip_il.serve.session import serve
 from manip_il.sim.window import has_display
@@ -27,18 +27,16 @@ def run_serve(options: ServeOptions) -> None:
     """Serve until the program ends or the user presses Ctrl-C."""
     leader, policy = options.session.get("leader", LEADERS[0]), None
     if leader not in LEADERS:
-        if not (path := Path(leader).expanduser()).exists():
-            raise UnknownName("leader", leader, (*LEADERS, "the folder of a policy"))
-        policy = find_policy(path)
+        policy = find_policy(Path(leader).expanduser())
     if leader == "sliders" and not has_display():
         raise UsageError("--leader=sliders opens a window, which needs a display; set DISPLAY")
-    env, _, seen = open_driver(policy, "expert", options.env, trust=options.trust)
+    env, _, seen = open_driver(policy, options.env, trust=options.trust)
     cameras = options.camera_config(env) if options.cameras else seen
     if idle := [one for one in options.vary if one in _IDLE]:
         raise UsageError(f"--vary={idle[0]} changes nothing for a served arm; use --servos.*, or --vary=servo")
     conditions = varied([one for one in options.vary if one != SERVO], env, sees=cameras is not None)
     session = SessionConfig(**options.session, servos=options.servos, varies=SERVO in options.vary)
     with exclusive(session.output_dir):
-        require_ours(session.output_dir, kind_of_output(options))
+        require_ours(session.output_dir, output_of("Serve"))
         save_options(session.output_dir, replace(options, command=[]))  # which may hold secrets
         serve(env, session, options.command, cameras, conditions, policy, say, trust=options.trust)

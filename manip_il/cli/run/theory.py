@@ -18,7 +18,7 @@ from manip_il.evaluation.side import read_member
 
 def run_theory(options: TheoryOptions) -> None:
     """Compute and measure; write the report and the JSON file; print the slopes."""
-    with options.output.open(options) as folder:
+    with options.open() as folder:
         shift = _shift(options, options.source) if options.source else None
         theory = Theory(tuple(chain(*map(curves, PROCESSES))), tuple(drifts()), shift)
         page = theory_report(theory)
@@ -31,7 +31,7 @@ def _shift(options: TheoryOptions, run: Path) -> Shift:
     validation = read_member(run).validation
     env = validation.env()
     count = count_episodes(env, options.cases) + options.episodes * (1 + len(rounds))
-    with progress(count, f"theory {run}") as bar, options.engine.open() as engine:
+    with progress(count, f"theory {run}") as bar, options.open_engine() as engine:
         certificate = certify(engine, env, options.cases, on_episode=lambda _: bar.step())
         u, conditions = certificate.mu or 0, validation.settings.conditions
         return measure_shift(engine, env, rounds, u, options.episodes, lambda _: bar.step(), conditions)

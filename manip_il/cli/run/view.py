@@ -9,11 +9,10 @@ from typing import Any
 
 from manip_il.cli.common_options import default_cameras
 from manip_il.cli.progress import say
-from manip_il.cli.run.inputs import open_driver
 from manip_il.cli.view import IN_A_FILE, ViewOptions
-from manip_il.collect.job import RolloutJob, observed_cameras, run_steps
+from manip_il.collect.job import HOLD, RolloutJob, observed_cameras, run_steps
 from manip_il.errors import UsageError
-from manip_il.evaluation.runner import HOLD
+from manip_il.evaluation.measuring import open_driver
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.evaluation.watch import RerunLog, WindowScreen, outcome
 from manip_il.seeding import BLOCK, stream_seeds
@@ -29,7 +28,7 @@ def run_view(options: ViewOptions) -> None:
     """Run episodes and show them."""
     in_window, sliders = options.output is None and has_display(), options.policy.type == "sliders"
     env, driver, cameras = open_driver(
-        options.policy.path, options.policy.type or "expert", options.env, trust=options.trust
+        options.policy.path, options.env, options.policy.type or "expert", trust=options.trust
     )
     if sliders and not in_window:
         raise UsageError("--policy.type=sliders opens a window: set DISPLAY and omit --output")

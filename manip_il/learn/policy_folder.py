@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from manip_il.errors import UsageError
 
@@ -32,3 +34,14 @@ def hub_hint(path: Path, kind: str = "") -> str:
     if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
         return ""
     return f"; if it is on the Hub, get it by manip-il pull hf://{kind}{path} FOLDER and give that FOLDER"
+
+
+def policy_folder(policy: Any) -> Path:
+    """Return the `pretrained_model` folder of a `Checkpoint`, or of a path that `find_policy` takes."""
+    return find_policy(Path(getattr(policy, "path", policy)).expanduser())
+
+
+def with_folder(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a fit's policy, with the `pretrained_model` folder that a `path` among them leads to."""
+    path = options.get("path")
+    return dict(options) if path is None else {**options, "path": str(policy_folder(path))}

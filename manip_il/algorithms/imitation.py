@@ -1,0 +1,102 @@
+"""Run DAgger, or another algorithm of imitation, in a folder."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+
+from manip_il import checks
+from manip_il.algorithms.config import RunConfig, check_labels
+from manip_il.algorithms.results import Result
+from manip_il.algorithms.run import Run
+from manip_il.collect.inputs import check_policy, open_dataset
+from manip_il.collect.workers import Engine, engine_of
+from manip_il.data.atomic import write_json
+from manip_il.data.ownership import CONFIG_FILE, output_of, require_ours
+from manip_il.data.schema import SIM_STATE, check_same_spec, features
+from manip_il.errors import ManipError, MismatchError
+from manip_il.learn.checkpoint import Checkpoint
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.sources import check_same_sources
+from manip_il.progress import Progress
+from manip_il.worlds.table import env_fingerprint, env_spec
+
+_LOG = logging.getLogger(__name__)
+
+
+def dagger(
+    output_dir: Path | str,
+    config: RunConfig,
+    *,
+    workers: int | Engine | None = 1,
+    progress: Progress | None = None,
+) -> list[Result]:
+    """Run DAgger, or another `method`, in a folder.
+
+    A folder with finished rounds is continued with the same options, except that `rounds` may be larger.
+
+    Args:
+        output_dir: The run's folder.
+        config: The run's options.
+        workers: Number of processes, None for one per core; or the engine to use.
+        progress: Follows the run.
+
+    Returns:
+        The results of all rounds, starting with 0 (cloning).
+
+    Raises:
+        UsageError: for options that contradict each other, or a folder with other files.
+        MismatchError: if the options differ from the folder's, or a dataset or a policy does not fit the environment.
+    """
+    folder = Path(output_dir).expanduser()
+    progress = progress or Progress()
+    check_labels(config)
+    check_inputs(config)
+    require_ours(folder, output_of("Dagger"))
+    progress.started()
+    if not (folder / CONFIG_FILE).is_file():  # from the command line, which compares its options itself
+        _check_same(folder / "settings.json", config)
+    write_json(folder / "fingerprint.json", env_fingerprint(config.env, config.cameras))
+    results = list[Result]()
+    with engine_of(workers) as engine:
+        engine.warm_up(learned=True)
+        for result in Run(config, folder, engine, progress).results():
+            results.append(result)
+            progress.finished(result)
+    return results
+
+
+def check_inputs(config: RunConfig) -> None:
+    """Raise `MismatchError` unless the datasets and the starting policy of a run fit its environment."""
+    recorded = None if config.redraw else config.cameras
+    here, run = env_spec(config.env, recorded), f"{config.env.robot} {config.env.task} of this run"
+    for root in config.datasets:
+        given = open_dataset(root)
+        if SIM_STATE not in given.features:
+            advice = "train a policy on it with manip-il train, and start from that: --policy.path=RUN"
+            raise ManipError(f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; {advice}")
+        check_same_sources((root, Path(run)), (given.spec, here), pictures=config.cameras is not None, language=False)
+        check_same_spec(str(root), given.spec, run, here, ["sim_state_size"])
+        if odd := sorted(features(given.spec).keys() ^ features(here).keys()):
+            raise ManipError(
+                f"only one of {root} and this run has {', '.join(odd)}; expected the same --cameras in both"
+            )
+    if config.start is not None:
+        check_policy(Checkpoint.open(config.start), config.env, trust=config.fit.trust)
+
+
+def _check_same(path: Path, config: RunConfig) -> None:
+    """Raise `MismatchError` if a run began with options other than `config`; then write it.
+
+    `rounds` may differ, and those options of the fit that change no result.
+    """
+    now = json.loads(json.dumps(asdict(replace(config, rounds=0)), default=str))
+    now["fit"] = {one.name: now["fit"][one.name] for one in fields(FitConfig) if not one.metadata.get("free")}
+    has_begun = any(path.parent.glob("round_*"))
+    before = checks.read_json(path, "a run's options") if has_begun and path.is_file() else now
+    for key in now:
+        if before.get(key) != now[key]:
+            raise MismatchError(key, str(path.parent), before[key], "this call", now[key])
+    write_json(path, now)

@@ -1,0 +1,244 @@
+"""Evaluate a policy, and run an episode of an evaluation again."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from manip_il import checks
+from manip_il.collect.drivers import Driver, PolicyDriver, driver_of
+from manip_il.collect.inputs import check_policy, env_config
+from manip_il.collect.job import HOLD, RolloutJob, observed_cameras
+from manip_il.collect.workers import Engine, engine_of
+from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.errors import UsageError, shorten
+from manip_il.evaluation.eval_report import eval_report
+from manip_il.evaluation.film import film_outcomes, run_states
+from manip_il.evaluation.report import REPORT_FILE
+from manip_il.evaluation.results import EpisodeResult, EvalResult, require_equal
+from manip_il.evaluation.runner import FOLDER, episode_hold, episode_result, measure, replay_differences
+from manip_il.evaluation.runner import evaluate as run_episodes
+from manip_il.evaluation.side import Side
+from manip_il.evaluation.suites import suite_conditions
+from manip_il.learn.checkpoint import Checkpoint
+from manip_il.learn.policy_folder import policy_folder
+from manip_il.mdp import Episode
+from manip_il.option import NameOrPath, make_options
+from manip_il.progress import Progress
+from manip_il.seeding import BLOCK, stream_seeds
+from manip_il.sim.conditions import NOMINAL
+from manip_il.sim.config import CameraConfig
+from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.table import env_fingerprint, env_of_name, env_spec
+
+_LOG = logging.getLogger(__name__)
+_MOST_UNTIL_WIDTH = 10_000  # episodes, if their number is not given
+_NO_FILES = ("expert", "random")  # drivers without a checkpoint
+Env = EnvConfig | str | Mapping[str, Any]
+
+
+def evaluate(
+    policy: Any = None,
+    env: Env | None = None,
+    episodes: int | None = None,
+    *,
+    kind: str = "expert",
+    suite: str = "",
+    stream: Literal["test", "validation"] = "test",
+    first: int = 0,
+    seed: int = 0,
+    hold: int | None = HOLD,
+    until_width: float | None = None,
+    output_dir: Path | None = None,
+    films: int = 0,
+    about: Mapping[str, Any] | None = None,
+    workers: int | Engine | None = 1,
+    trust: bool = False,
+    device: str = "cpu",
+    progress: Progress | None = None,
+    **options: Any,
+) -> EvalResult:
+    """Evaluate a policy, by default the expert, on unseen seeds.
+
+    Args:
+        policy: A `Checkpoint`, or the path of a checkpoint or a run.
+        env: The environment, its name, or those of its settings that differ from the policy's training environment.
+        episodes: Number of episodes, by default 100; at most 10,000 with `until_width`.
+        kind: Who drives without a policy: expert or random.
+        suite: Test conditions, by default nominal; or only their name, if `conditions` is among the options.
+        stream: Which stream of seeds.
+        first: Index of the first seed in the stream.
+        seed: 0 to 1000.
+        hold: Control steps after success until an episode ends; None: it ends at the horizon.
+        until_width: Stop when the confidence interval is this narrow.
+        output_dir: Folder for `eval.json` and the finished episodes, which are not run again.
+        films: Number of failures to film for the report, and of successes.
+        about: Further fields of the report, `report.html` in the folder; None for no report.
+        workers: Number of processes, None for one per core; or the engine to use.
+        trust: Whether to load models and code that the checkpoint names.
+        device: Where the policy runs.
+        progress: Follows the evaluation.
+        options: Fields of `RolloutJob`, such as `conditions`.
+
+    Returns:
+        The outcome of every episode.
+
+    Raises:
+        UsageError: if neither `env` nor the policy names an environment.
+        MismatchError: if the policy does not fit `env`, or the folder holds another evaluation.
+    """
+    progress = progress or Progress()
+    with engine_of(workers) as engine:
+        engine.warm_up(learned=policy is not None)  # meanwhile this process checks the policy
+        env, driver, cameras = open_driver(policy, env, kind, trust=trust, device=device)
+        if "conditions" not in options:
+            suite = suite or NOMINAL.name
+            options["conditions"] = suite_conditions(suite, env, sees=cameras is not None)
+        suite = suite or "_".join(one.name for one in options["conditions"])
+        chosen: dict[str, Any] = {"hold": episode_hold(env, hold), "label": "last"}
+        job = make_options(RolloutJob, env=env, driver=driver, **chosen | options)
+        most = 100 if until_width is None else _MOST_UNTIL_WIDTH
+        count = checks.whole("episodes", most if episodes is None else episodes, 1, BLOCK - first)
+        seeds = stream_seeds(stream, first + count, seed)[first:]
+        name = kind if policy is None else str(getattr(policy, "path", policy))
+        progress.started()
+        if output_dir is None:
+            return run_episodes(engine, job, seeds, name, progress.episode, suite=suite, until_width=until_width)
+        result = measure(engine, job, seeds, name, output_dir, progress, suite=suite, until_width=until_width)
+        made = film_outcomes(engine, job, result, films, progress)
+    if about is not None:
+        replace(eval_report(result, *made), **about).write(output_dir / REPORT_FILE)
+    return result
+
+
+def measure_sides(
+    sides: Sequence[Side],
+    envs: Mapping[str, EnvConfig],
+    folder: Path,
+    *,
+    episodes: int,
+    suite: str,
+    seed: int = 0,
+    trust: bool = False,
+    engine: Engine,
+    progress: Progress,
+) -> tuple[Side, ...]:
+    """Evaluate the policies of a comparison on the same seeds; finished episodes in the folder are not run again.
+
+    Args:
+        sides: The sides; their members have policies.
+        envs: Name of a side -> its environment.
+        folder: Folder for the evaluations.
+        episodes: Number of test episodes.
+        suite: Test conditions; those on cameras count only if some policy uses cameras.
+        seed: 0 to 1000.
+        trust: Whether to load models and code that a checkpoint names.
+        engine: Runs the episodes.
+        progress: Follows the evaluations.
+
+    Returns:
+        The sides, with the results of their members.
+
+    Raises:
+        MismatchError: before any episode runs, if a policy does not fit its environment.
+    """
+    members = [(envs[side.name], member) for side in sides for member in side.members]
+    drivers = [open_driver(member.policy, env, trust=trust) for env, member in members]
+    sees = any(cameras for *_, cameras in drivers)
+    seeds = stream_seeds("test", episodes, seed)
+    results = list[EvalResult]()
+    progress.started()
+    for (env, driver, _), (_, member) in zip(drivers, members, strict=True):
+        conditions = suite_conditions(suite, env, sees=sees)
+        job = RolloutJob(env, driver, episode_hold(env), label="last", conditions=conditions)
+        digest = job.policy.sha256[:8] if job.policy else driver.name
+        words = f"{re.sub(r'[^A-Za-z0-9]+', '_', member.name)[-80:]}_{digest}"
+        results.append(measure(engine, job, seeds, member.name, folder / FOLDER / words, progress, suite=suite))
+    found = iter(results)
+    return tuple(
+        replace(side, members=tuple(replace(member, result=next(found)) for member in side.members)) for side in sides
+    )
+
+
+def open_driver(
+    policy: Any, env: Env | None, kind: str = "expert", *, trust: bool = False, device: str = "cpu"
+) -> tuple[EnvConfig, Driver, CameraConfig | None]:
+    """Return the environment, the checked driver and the cameras whose pictures the driver takes.
+
+    The arguments are those of `evaluate`. Raises what `check_policy` raises.
+    """
+    checkpoint = None
+    if policy is not None:
+        checkpoint = policy if isinstance(policy, Checkpoint) else Checkpoint.open(policy_folder(policy))
+    origin = checkpoint.origin if checkpoint else None
+    if env is None and origin is None:
+        raise UsageError("env is missing, and the policy does not name one")
+    env = env_config(env or {}, origin) if env is None or isinstance(env, Mapping) else env_of_name(env)
+    if checkpoint is None:
+        return env, driver_of(kind), None
+    check_policy(checkpoint, env, trust=trust)
+    return env, PolicyDriver((checkpoint,), trust=trust, device=device), checkpoint.cameras
+
+
+@dataclass(frozen=True)
+class Replay:
+    """An episode of an evaluation that was run again. differences: between both runs, in words."""
+
+    before: EpisodeResult
+    job: RolloutJob
+    episode: Episode
+    differences: list[str]
+
+
+def replay(
+    file: Path,
+    seed: int,
+    policy: Path | None = None,
+    *,
+    robot: NameOrPath | None = None,
+    task: NameOrPath | None = None,
+    object: NameOrPath | None = None,
+    trust: bool = False,
+) -> Replay:
+    """Run one episode of an evaluation again; warn if the policy or this program has changed since.
+
+    The policy, and a robot, a task or a mesh of the user's own, must be given again: no path in the file is opened.
+
+    Args:
+        file: The `eval.json` or its folder.
+        seed: Seed of the episode.
+        policy: The policy of the evaluation.
+        robot: The user's own robot.
+        task: The user's own task.
+        object: The user's own mesh.
+        trust: Whether to load models and code that the checkpoint names.
+
+    Returns:
+        Both runs of the episode.
+
+    Raises:
+        UsageError: if the evaluation has no such seed, or its policy is not given.
+        MismatchError: if what is given has another robot or task.
+    """
+    result = EvalResult.read(file)
+    by_seed = {episode.seed: episode for episode in result.episodes}
+    if seed not in by_seed:
+        raise UsageError(f"--replay is {seed}; {file} has seeds {min(by_seed)} to {max(by_seed)}")
+    env = result.env(robot, task, object)
+    require_equal(str(file), result, "what is given", env_spec(env), "robot", "task")
+    if policy is None and result.policy not in _NO_FILES:
+        raise UsageError(f"{file} evaluates the policy {shorten(result.policy)}; give that with --policy.path=DIR")
+    _, driver, _ = open_driver(policy, env, result.policy, trust=trust)
+    settings = result.settings
+    job = RolloutJob(env, driver, settings.hold, label="last", conditions=settings.conditions)
+    if job.policy is not None and result.policy_sha256 not in ("", job.policy.sha256):
+        _LOG.warning("%s is not the policy of %s: its files differ", policy, file)
+    here = env_fingerprint(env, observed_cameras(job))
+    for line in compare_fingerprints(str(file), dict(result.fingerprint), "this machine", here):
+        _LOG.warning(line)
+    episode = run_states(job, seed)
+    return Replay(by_seed[seed], job, episode, replay_differences(by_seed[seed], episode_result(job, episode)))
