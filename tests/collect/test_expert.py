@@ -18,8 +18,8 @@ from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.world import GOAL, Scene, World
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import get_task
-from manip_il.worlds.ladder.envs import env_of, scene_of
-from manip_il.worlds.table import make_config
+from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.table import make_config, make_env
 
 from ..scenes import sizes_of, started
 from ..tables import every_robot, every_scene, every_scene_with_a_cube
@@ -77,7 +77,7 @@ def test_a_label_read_off_a_running_world_is_that_of_its_state(robot: str, task:
     conditions = (*(sizes_of(task) if driver == "varied" else ()), *([knocked] if knocked else ()))
     config, expert = make_config(robot, task, horizon=30), expert_of(robot, task)
     job = RolloutJob(config, driver_of(driver), hold=3, conditions=conditions)
-    for step in run_steps(job, [env_of(config, None, conditions)], stream_seeds("certificate", 2)):
+    for step in run_steps(job, [make_env(config, None, conditions)], stream_seeds("certificate", 2)):
         assert step.label is not None
         assert written(step.label) == written(expert.label(step.state))
 
