@@ -21,7 +21,7 @@ from manip_il import Expert
 from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import ManipEnv
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 STEPS = 30  # steps per episode: how many the expert takes from the start to the goal
 

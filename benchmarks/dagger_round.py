@@ -26,7 +26,7 @@ from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import State
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 
 LIMIT, SHARE = 30.0, 0.15  # time of a round [s], and the largest share of it for labelling
 

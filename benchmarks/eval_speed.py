@@ -35,7 +35,7 @@ from manip_il.mdp import Episode
 from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import env_spec, make_config
 
 BIN = Path(sys.executable).parent

@@ -24,7 +24,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # must be set before MuJoCo is imported
 

@@ -26,12 +26,11 @@ from numpy.typing import NDArray
 from manip_il.chapter.inverse import CARRY, METHODS, learn, read_carried
 from manip_il.cli.main import main as manip_il
 from manip_il.seeding import rng_for, stream_base, stream_seeds
-from manip_il.tasks.carry.grid import Grid
+from manip_il.tasks.carry.grid import Grid, PathProblem, cheapest_path, plan
 from manip_il.tasks.carry.layout import TASTES
 from manip_il.tasks.carry.obstacles import layout_of
-from manip_il.tasks.carry.paths import PathProblem, cheapest_path, plan
 from manip_il.tasks.pick_place import OBJECT
-from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import make_config
 
 F64 = NDArray[np.float64]

@@ -26,7 +26,7 @@ from manip_il.mdp import State
 from manip_il.robots import ROBOTS, ik
 from manip_il.seeding import stream_seeds
 from manip_il.tasks.table import TASKS
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 from manip_il.worlds.table import make_config
 
 

@@ -29,7 +29,7 @@ from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, FILM, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import camera_id
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 SIZES = ((128, 128), (240, 320), (480, 640))
 STATES = 6  # number of states from one expert episode, evenly spaced

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from _machine import describe_machine
 
-from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import make_config
 
 os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa renders on the calling core, here and in the limit

@@ -38,7 +38,7 @@ from manip_il.tasks.carry.layout import OBSTACLES, TASTES, Layout, Reward
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.envs import env_of, scene_of
+from manip_il.worlds.ladder.world import env_of, scene_of
 from manip_il.worlds.table import env_spec, make_config
 
 FEW = 2  # most things in a demonstrated layout

@@ -16,7 +16,7 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.config import FILM
 from manip_il.sim.render import Picture
 from manip_il.tasks.table import TASKS
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 FRAMES = 6  # frames per strip
 CROP = (slice(90, 450), slice(130, 610))  # part of the front camera's picture with the task in it [pixels]

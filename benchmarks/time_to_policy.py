@@ -26,9 +26,9 @@ from _machine import describe_machine
 
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.run import Run
-from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.imitation import DaggerOptions
 from manip_il.cli.parsing import from_yaml
-from manip_il.cli.run.dagger import dagger_config
+from manip_il.cli.run.imitation import dagger_config
 from manip_il.collect.workers import Engine, default_workers
 
 HERE = Path(__file__).parent

@@ -31,9 +31,9 @@ _HOMES = {  # public name -> module, and the name there if it differs
     "dagger": "algorithms.imitation",
     "evaluate": "evaluation.measuring",
     "make_config": "worlds.table",
-    "make_env": "worlds.ladder.envs",
-    "record": "collect.recording",
-    "train": "learn.training",
+    "make_env": "worlds.ladder.world",
+    "record": "collect.record",
+    "train": "learn.train",
 }
 
 

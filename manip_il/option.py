@@ -31,7 +31,7 @@ def typed(text: NameOrPath) -> NameOrPath:
 def option(default: Any, help_text: str, **metadata: Any) -> Any:
     """Return a dataclass field. default: a value, a class or function that makes one, or `MISSING` for none.
 
-    metadata: `at_least` and `at_most` (see `check_bound`), and the keys of `manip_il.cli.options.Option`.
+    metadata: `at_least` and `at_most` (see `check_bound`), and the keys of `manip_il.cli.parsing.Option`.
     """
     metadata = {"help": help_text, **metadata}
     if callable(default):

@@ -33,8 +33,7 @@ settings.load_profile("manip_il")
 # starts decides for all: without this the first test to need it decides, and every later worker that drives a policy
 # imports torch and LeRobot anew, six seconds each.
 IMPORTED_ONCE = [
-    "manip_il.cli.record",
-    "manip_il.cli.dagger",
+    "manip_il.cli.imitation",
     "manip_il.cli.evaluate",
     "manip_il.algorithms.run",
     "manip_il.collect.record",

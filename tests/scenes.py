@@ -12,7 +12,7 @@ from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import phases
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.table import TASKS
-from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.ladder.world import make_env, scene_of
 
 SEED = 5_000_000
 SIZES = Condition("sizes", size=(0.03, 0.07), mass=(0.05, 0.3))

@@ -10,9 +10,9 @@ import pytest
 from manip_il import checks
 from manip_il.bridges.mcap.importing import read_messages
 from manip_il.bridges.store.manifest import File
+from manip_il.data.atomic import read_lines
 from manip_il.data.camera import open_video
 from manip_il.data.journal import read_journal
-from manip_il.data.json_lines import read_lines
 from manip_il.data.parquet_files import count_rows, read_file
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.network import read_weights

@@ -96,12 +96,12 @@ def test_other_code_is_found_by_the_packages_own_tables_alone():
 
 def test_a_text_becomes_a_path_only_where_a_person_typed_it():
     assert {(file, function) for file, function, _ in calls("typed")} == {
-        ("cli/options.py", "decode"),
+        ("cli/parsing.py", "decode"),
         ("lerobot_plugin/environment.py", "_given"),
         ("worlds/table.py", "make_config"),
     }
     assert {(file, function) for file, function, _ in calls("make_config")} == {
         ("evaluation/robot_check.py", "check_robot"),  # of the robot on the command line
         ("worlds/table.py", "env_of_name"),  # written in Python
-        ("worlds/ladder/envs.py", "make_env"),
+        ("worlds/ladder/world.py", "make_env"),
     }

@@ -22,7 +22,7 @@ from manip_il.sim.env import ManipEnv
 from manip_il.sim.shape import KINDS as SHAPES
 from manip_il.sim.variation import with_drawn
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from .pictures import read_episodes

@@ -13,8 +13,7 @@ from manip_il.algorithms.results import Result
 from manip_il.algorithms.run import Run
 from manip_il.collect.inputs import check_policy, open_dataset
 from manip_il.collect.workers import Engine, engine_of
-from manip_il.data.atomic import write_json
-from manip_il.data.ownership import CONFIG_FILE, output_of, require_ours
+from manip_il.data.atomic import CONFIG_FILE, output_of, require_ours, write_json
 from manip_il.data.schema import SIM_STATE, check_same_spec, features
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.checkpoint import Checkpoint

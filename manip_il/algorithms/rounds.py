@@ -18,9 +18,9 @@ from typing import Any
 
 from manip_il.algorithms.config import RunConfig
 from manip_il.collect.drivers import ExpertDriver, PolicyDriver
+from manip_il.collect.edits import Scenes
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import journal_of
-from manip_il.collect.scenes import Scenes
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import Recording, dataset_sha256, merge_datasets
 from manip_il.data.dataset import Dataset

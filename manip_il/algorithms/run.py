@@ -39,18 +39,15 @@ from manip_il.algorithms.rounds import (
     round_scenes,
 )
 from manip_il.collect.drivers import Driver, PolicyDriver
-from manip_il.collect.edits import EditSource, EditTarget, redraw_dataset
+from manip_il.collect.edits import CHUNK, EditSource, EditTarget, redraw_dataset
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import Query
 from manip_il.collect.record import MAX_TRIES, collect, collect_successes, provenance
-from manip_il.collect.scenes import CHUNK
 from manip_il.collect.workers import Engine, default_workers
-from manip_il.data.atomic import new_folder
+from manip_il.data.atomic import CHECKPOINT, append_line, new_folder, read_lines
 from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes, read_journal
-from manip_il.data.json_lines import append_line, read_lines
-from manip_il.data.ownership import CHECKPOINT
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import METRICS_FILE
 from manip_il.evaluation.runner import evaluate

@@ -24,13 +24,12 @@ from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
 from manip_il.mdp import F64, I64
 from manip_il.robots.table import get_robot
-from manip_il.tasks.carry.grid import Grid
+from manip_il.tasks.carry.grid import LENGTH, Demonstration, Grid, cheapest_path, open_features, plan, rivals
 from manip_il.tasks.carry.layout import FEATURES
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
-from manip_il.tasks.carry.paths import LENGTH, Demonstration, cheapest_path, open_features, plan, rivals
 from manip_il.tasks.ladder import AT_GOAL
 from manip_il.tasks.pick_place import OBJECT
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 
 METHODS = ("max_margin", "bayesian", "max_entropy")
 LEVEL = 0.9  # level of the credible intervals

@@ -31,9 +31,8 @@ from manip_il.chapter.ppo import Learner, save_policy, seed_generators, start_co
 from manip_il.chapter.reward import LearnedReward
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import HOLD, RolloutJob
-from manip_il.data.atomic import new_folder
+from manip_il.data.atomic import CHECKPOINT, kind_of, new_folder
 from manip_il.data.dataset import Dataset
-from manip_il.data.ownership import CHECKPOINT, kind_of
 from manip_il.errors import UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line

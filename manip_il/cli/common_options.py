@@ -6,7 +6,7 @@ from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from manip_il.cli.options import Given, given
+from manip_il.cli.parsing import Given, given
 from manip_il.option import keyword, option
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.worlds.config import WORLDS, EnvConfig

@@ -1,15 +1,21 @@
-"""`manip-il eval`: how often a policy succeeds on unseen seeds."""
+"""`manip-il eval`: how often a policy succeeds on unseen seeds.
+
+`manip-il compare`: two policies or runs on the same seeds, with the confidence in their difference, or a study.
+
+A study runs `manip-il dagger` with several sets of options (its arms), each with the same training seeds.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting
-from manip_il.cli.options import Given, given
 from manip_il.cli.outputs import ResumableOutput, output_folder
+from manip_il.cli.parsing import Given, Open, given
 from manip_il.option import Seeded, option
+from manip_il.seeding import MAX_SEED
 from manip_il.worlds.config import EnvConfig
 
 
@@ -65,3 +71,68 @@ class EvalOptions(Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
     replay: int | None = option(None, "seed of the episode of EVALUATION to replay", at_least=0, free=True)
     video: Path | None = option(None, "MP4 file for the replay", free=True)
     health: bool = option(False, "check that this machine can evaluate and render", flag="check", free=True)
+
+
+@dataclass(frozen=True)
+class TrialGroup:
+    """`--eval.*`: the test episodes."""
+
+    n_episodes: int = option(500, "test episodes", at_least=1, grows=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonOptions:
+    """Which rounds of the runs are compared, and on how many episodes."""
+
+    checkpoint: Literal["best", "last"] = option("best", "round of a run to test: the best on validation, or the last")
+    at: Literal["end", "labels", "episodes", "steps", "seconds"] = option(
+        "end",
+        "which rounds of a run count: all (end), or those within the number of labels, episodes, steps or seconds (of "
+        "collecting and fitting) that every run reached",
+    )
+    eval: TrialGroup = field(default_factory=TrialGroup)
+
+
+@dataclass(frozen=True)
+class StudyFile(ComparisonOptions):
+    """Content of a study's YAML file.
+
+    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs. Arms of
+    different tasks are not compared.
+    """
+
+    common: Open = field(default_factory=dict[str, Any])
+    arms: Open = field(default_factory=dict[str, Any])
+    training_seeds: int = option(3, "runs of every arm, one per seed", at_least=1, at_most=MAX_SEED, grows=True)
+    baseline: str | None = option(None, "the arm to compare others with; by default the first")
+    target: float = option(0.95, "report what it costs to reach this validation success", at_least=0.0, at_most=1.0)
+
+
+@dataclass(frozen=True)
+class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
+    """Compare two policies, runs, or folders of several training seeds on the same test seeds; or run a whole study.
+
+    Each side is an eval.json, a policy, a run of manip-il dagger, or a folder with one of these per training seed
+    (seed_0, seed_1, ...). Two eval.json files are compared directly; other sides are evaluated first. Writes
+    compare.json and report.html.
+
+    One YAML file instead of two sides is a study: every arm (a set of options) is trained with several seeds, tested
+    on the same unseen seeds, and compared. The file holds `common` and `arms` (options of manip-il dagger),
+    training_seeds, eval, checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs.
+
+    Example: manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare
+    """
+
+    first: ClassVar[str] = "at eval.n_episodes suite output_dir resume training_seeds"
+    sides: list[Path] = option(
+        MISSING,
+        "two sides, each an eval.json, a policy or a run; or the YAML file of a study",
+        positional=True,
+        exists="",
+        free=True,
+    )
+    env: Given = given(EnvConfig, **OF_POLICY)
+    training_seeds: int | None = option(
+        None, "training seeds of a study, if not its file's; may grow with --resume=true", at_least=1, free=True
+    )
+    output_dir: Path = output_folder("runs/compare")

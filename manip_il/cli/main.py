@@ -19,8 +19,7 @@ from typing import Any
 from manip_il import __version__
 from manip_il.bridges.store.errors import redact
 from manip_il.cli import progress
-from manip_il.cli.options import Option, metavar, options_of, word
-from manip_il.cli.parsing import check_paths, parse
+from manip_il.cli.parsing import Option, check_paths, metavar, options_of, parse, word
 from manip_il.errors import ManipError, UnknownName, printable, silence_ffmpeg_warning, told
 
 PROGRAM = "manip-il"
@@ -30,39 +29,39 @@ EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 # name -> `module:OptionsClass` in `manip_il.cli`, and a summary. The function is in the module of `manip_il.cli.run`
 # with the same name or, so that it imports only what it needs, in the one that a third part names.
 COMMANDS = {
-    "demo": ("demo:DemoOptions", "run a small complete example: record, clone, DAgger, report"),
-    "record": ("record:RecordOptions", "record demonstrations of the expert as a dataset"),
-    "train": ("train:TrainOptions", "train a policy on a dataset (behaviour cloning)"),
-    "dagger": ("dagger:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),
+    "demo": ("imitation:DemoOptions", "run a small complete example: record, clone, DAgger, report"),
+    "record": ("imitation:RecordOptions:record", "record demonstrations of the expert as a dataset"),
+    "train": ("imitation:TrainOptions:train", "train a policy on a dataset (behaviour cloning)"),
+    "dagger": ("imitation:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),
     "eval": ("evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
-    "compare": ("compare:CompareOptions", "compare policies, runs or whole studies on the same seeds"),
-    "view": ("view:ViewOptions", "watch a robot at its task, in a window or a browser"),
-    "serve": ("serve:ServeOptions", "run a virtual SO-101 for LeRobot's own programs"),
+    "compare": ("evaluate:CompareOptions:imitation", "compare policies, runs or whole studies on the same seeds"),
+    "view": ("robots:ViewOptions:view", "watch a robot at its task, in a window or a browser"),
+    "serve": ("robots:ServeOptions:serve", "run a virtual SO-101 for LeRobot's own programs"),
     "push": ("transfer:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
     "pull": ("transfer:PullOptions", "download a dataset or policy and verify every file"),
     "export": ("transfer:ExportOptions:export", "export a policy as ONNX"),
-    "theory": ("theory:TheoryOptions", "compare the proven bounds of cloning and DAgger with a run"),
-    "data check": ("data_check:CheckOptions", "find errors in any LeRobot dataset"),
-    "data repair": ("data_check:RepairOptions", "repair a dataset, from its journals or its own data"),
-    "data render": ("data_edits:RenderOptions", "render a dataset again, with other cameras, sizes or lights"),
-    "data redraw": ("data_edits:RedrawOptions", "randomise and render visited states for policies with cameras"),
-    "data relabel": ("data_edits:RelabelOptions", "relabel a dataset with the current expert"),
-    "data build": ("data_edits:BuildOptions", "rebuild a dataset from its journals"),
-    "data merge": ("data_edits:MergeOptions", "merge datasets of one robot and task"),
-    "data score": ("data_check:ScoreOptions:score", "score a dataset's episodes by a reward, to find bad ones"),
+    "theory": ("chapter:TheoryOptions:theory", "compare the proven bounds of cloning and DAgger with a run"),
+    "data check": ("data:CheckOptions", "find errors in any LeRobot dataset"),
+    "data repair": ("data:RepairOptions", "repair a dataset, from its journals or its own data"),
+    "data render": ("data:RenderOptions", "render a dataset again, with other cameras, sizes or lights"),
+    "data redraw": ("data:RedrawOptions", "randomise and render visited states for policies with cameras"),
+    "data relabel": ("data:RelabelOptions", "relabel a dataset with the current expert"),
+    "data build": ("data:BuildOptions", "rebuild a dataset from its journals"),
+    "data merge": ("data:MergeOptions", "merge datasets of one robot and task"),
+    "data score": ("data:ScoreOptions:chapter", "score a dataset's episodes by a reward, to find bad ones"),
     "data to-mcap": ("transfer:McapExportOptions:mcap", "convert a dataset to MCAP files, for Foxglove etc."),
     "data from-mcap": ("transfer:McapImportOptions:mcap", "convert MCAP files to a dataset with a mapping file"),
-    "robot new": ("robot:RobotNewOptions", "write a first YAML file for an arm's MJCF"),
-    "robot check": ("robot:RobotCheckOptions", "measure what an arm can do, before recording"),
-    "robot certify": ("robot:CertifyOptions", "measure from which states the expert recovers"),
-    "rl gail": ("learning:GailOptions", "imitate by GAIL: reinforcement learning from demonstrations"),
-    "rl airl": ("learning:AirlOptions", "imitate by AIRL, which also learns a reward"),
-    "rl ppo": ("learning:PpoOptions", "improve a cloned policy with a reward learnt from preferences"),
-    "reward irl": ("reward:IrlOptions:irl", "learn a reward from demonstrations of the task carry"),
-    "reward pairs": ("reward:PairsOptions", "choose pairs of clips to compare"),
-    "reward ask": ("reward:AskOptions", "make a page that asks which clip is better"),
-    "reward answer": ("reward:AnswerOptions", "let a simulated teacher answer pairs by true progress"),
-    "reward fit": ("reward:FitOptions", "learn a reward from answers"),
+    "robot new": ("robots:RobotNewOptions", "write a first YAML file for an arm's MJCF"),
+    "robot check": ("robots:RobotCheckOptions", "measure what an arm can do, before recording"),
+    "robot certify": ("robots:CertifyOptions", "measure from which states the expert recovers"),
+    "rl gail": ("chapter:GailOptions:learning", "imitate by GAIL: reinforcement learning from demonstrations"),
+    "rl airl": ("chapter:AirlOptions:learning", "imitate by AIRL, which also learns a reward"),
+    "rl ppo": ("chapter:PpoOptions:learning", "improve a cloned policy with a reward learnt from preferences"),
+    "reward irl": ("chapter:IrlOptions", "learn a reward from demonstrations of the task carry"),
+    "reward pairs": ("chapter:PairsOptions", "choose pairs of clips to compare"),
+    "reward ask": ("chapter:AskOptions", "make a page that asks which clip is better"),
+    "reward answer": ("chapter:AnswerOptions", "let a simulated teacher answer pairs by true progress"),
+    "reward fit": ("chapter:FitOptions", "learn a reward from answers"),
 }
 GROUPS = {
     "data": "check, repair, edit, score and convert datasets",

@@ -8,11 +8,20 @@ from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from manip_il.cli.options import command_line, options_of, to_plain
-from manip_il.cli.parsing import dump_yaml, from_yaml
+from manip_il.cli.parsing import command_line, dump_yaml, from_yaml, options_of, to_plain
 from manip_il.cli.progress import say
-from manip_il.data.atomic import clear, exclusive, write_file, write_json
-from manip_il.data.ownership import CONFIG_FILE, PARTIAL, is_our_file, kind_of, output_of, require_replaceable
+from manip_il.data.atomic import (
+    CONFIG_FILE,
+    PARTIAL,
+    clear,
+    exclusive,
+    is_our_file,
+    kind_of,
+    output_of,
+    require_replaceable,
+    write_file,
+    write_json,
+)
 from manip_il.errors import MismatchError, UsageError
 from manip_il.option import keyword, option
 

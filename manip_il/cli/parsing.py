@@ -1,34 +1,230 @@
 """Options from the command line (`--a.b=c`) and YAML, in LeRobot's style; the command line overrides YAML.
 
-Draccus decodes the values (see `options.decode`). Its parser is not used because it exits through argparse, turns a
+Draccus decodes the values (see `decode`). Its parser is not used because it exits through argparse, turns a
 range error of a nested dataclass into a decoding error, and has no open groups.
+
+Options of commands: the fields of their dataclasses, the values that a type accepts, and their names in help.
+
+A field's type is int, float, bool, str, Path, `NameOrPath` or a `Literal` of names; one of these or None; a list of one
+of these; a class with `parse` and `__str__` (`linear:5`); another dataclass (a group, `--dataset.root`); or `Open`: a
+dict of a group whose options only another program knows (`--policy.*`). `given(Config)` is a dict of the options of
+`Config` that the user gave; the command makes a `Config` from them.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import json
+import operator
+import re
+import shlex
+import sys
+import types
 import typing
-from collections.abc import Mapping, Sequence
-from dataclasses import MISSING
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, Union
 
 from manip_il import __version__
-from manip_il.checks import read_yaml, shorten
-from manip_il.cli.options import (
-    Option,
-    decode,
-    default_of,
-    from_word,
-    metavar,
-    options_of,
-    to_plain,
-    without_none,
-)
-from manip_il.data.ownership import CONFIG_HEADER
+from manip_il.checks import parse_yaml, read_yaml, shorten
+from manip_il.data.atomic import CONFIG_HEADER
 from manip_il.errors import ManipError, UsageError, nearest
-from manip_il.learn.policy_folder import hub_hint
-from manip_il.option import check_bound, type_of
+from manip_il.learn.checkpoint import hub_hint
+from manip_il.option import NameOrPath, check_bound, type_of, typed
+
+Open = dict[str, Any]  # option -> value as read by YAML
+Given = dict[str, Any]  # field -> value
+_METAVARS: dict[Any, str] = {
+    int: "INT",
+    float: "FLOAT",
+    bool: "true|false",
+    str: "TEXT",
+    Path: "PATH",
+    NameOrPath: "TEXT",
+}
+
+
+def given(
+    cls: type, prefix: str | None = None, only: Collection[str] = (), fixed: Collection[str] = (), **own: Any
+) -> Any:
+    """Return a field that holds, as a dict (`Given`), those options of the dataclass `cls` that the user gave.
+
+    only: names of fields, by default all. fixed: those that may not grow when this command is resumed. own: defaults
+    that replace those of `cls`; the dict always holds them.
+    """
+    metadata = {"given": cls, "only": only, "fixed": fixed}
+    names = {} if prefix is None else {"prefix": prefix}
+    return field(default_factory=functools.partial(dict, own), metadata=metadata | names)
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a command. default: `MISSING` if the user must give a value.
+
+    path: attributes and keys that lead from the command's options to its value. metadata: `help`, one line;
+    `positional` for a value without a name; `command_line_only` for an option that no file may set; `exists` for a path
+    that must exist, with its prefix on the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`; `free`
+    and `grows` for an option that a resumed run may change (see `check_same_options`). is_given: whether
+    it is an option of another class, see `given`.
+    """
+
+    name: str  # dotted: `dataset.root`
+    path: tuple[str, ...]
+    type: Any
+    default: Any
+    metadata: Mapping[str, Any]
+    is_given: bool = False
+
+    @property
+    def positional(self) -> bool:
+        """Whether the value is given without the option's name."""
+        return self.metadata.get("positional", False)
+
+    @property
+    def label(self) -> str:
+        """The name as the user writes it."""
+        if self.positional:
+            return f"{self.name.upper()}..." if self.is_list else self.name.upper()
+        return f"--{self.name}.NAME" if self.is_open else f"--{self.name}"
+
+    @property
+    def is_list(self) -> bool:
+        """Whether the option takes several values."""
+        return typing.get_origin(self.type) is list
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the option is a group of options whose names only another program knows."""
+        return typing.get_origin(self.type) in (dict, Mapping)
+
+    def value(self, options: Any) -> Any:
+        """Return the option's value in a command's options."""
+        for key in self.path:
+            options = options.get(key, self.default) if isinstance(options, dict) else getattr(options, key)
+        return options
+
+
+def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, ...] = ()) -> list[Option]:
+    """Return all options of a dataclass, groups expanded, keyword-only ones last. base: instance with the defaults."""
+    found: list[Option] = []
+    for one in sorted(dataclasses.fields(cls), key=lambda one: one.kw_only is True):
+        inner, here = one.metadata.get("prefix", f"{prefix}{one.name}."), (*path, one.name)
+        kind, default = type_of(cls, one), default_of(one, base)
+        if source := one.metadata.get("given"):
+            for theirs in dataclasses.fields(source):
+                if "help" in theirs.metadata and theirs.name in (one.metadata["only"] or (theirs.name,)):
+                    name = theirs.metadata.get("flag", inner + theirs.name)
+                    own, about = default.get(theirs.name, default_of(theirs)), dict(theirs.metadata)
+                    if theirs.name in one.metadata["fixed"]:
+                        about["grows"] = False
+                    found.append(Option(name, (*here, theirs.name), type_of(source, theirs), own, about, is_given=True))
+        elif dataclasses.is_dataclass(kind):
+            found += options_of(typing.cast(type, kind), None if default is MISSING else default, inner, here)
+        else:
+            found.append(Option(one.metadata.get("flag", prefix + one.name), here, kind, default, one.metadata))
+    return found
+
+
+def default_of(one: dataclasses.Field[Any], base: Any = None) -> Any:
+    """Return a field's value in `base`, else its default, else `MISSING`."""
+    if base is not None:
+        return getattr(base, one.name)
+    return one.default if one.default_factory is MISSING else one.default_factory()
+
+
+def to_plain(options: Any) -> dict[str, Any]:
+    """Return a command's options as a tree of plain YAML values, keyed by option names.
+
+    Omits what concerns one call alone, so that a file made from it never replaces or continues another output.
+    """
+    tree: dict[str, Any] = {}
+    for one in options_of(type(options)):
+        if not one.metadata.get("command_line_only") and one.name not in ("overwrite", "resume"):
+            *groups, last = one.name.split(".")
+            place = functools.reduce(lambda inner, name: inner.setdefault(name, {}), groups, tree)
+            place[last] = _plain(one.value(options))
+    return tree
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) or hasattr(value, "parse") else value
+
+
+def command_line() -> str:
+    """Return the command as typed, quoted for a shell."""
+    return shlex.join(["manip-il", *sys.argv[1:]])
+
+
+def word(value: Any) -> str:
+    """Return a value as written on the command line."""
+    plain = _plain(value)
+    if isinstance(plain, list):
+        return ",".join(map(str, plain))
+    return json.dumps(plain) if plain is None or isinstance(plain, bool) else str(plain)
+
+
+def metavar(option_type: Any) -> str:
+    """Return the placeholder of a value in help and errors: `INT`, `PATH`, `mse|l1`, `FLOAT,...`."""
+    option_type = without_none(option_type)
+    if typing.get_origin(option_type) is list:
+        return f"{metavar(typing.get_args(option_type)[0])},..."
+    if typing.get_origin(option_type) is Literal:
+        return "|".join(typing.get_args(option_type))
+    return _METAVARS.get(option_type, "VALUE")
+
+
+def from_word(option_type: Any, word: str) -> Any:
+    """Return the value of a command-line word: None for `null`, texts for a list type, else the word itself."""
+    some = without_none(option_type)
+    if some != option_type and word in ("null", "none"):
+        return None
+    if typing.get_origin(some) is not list:
+        return word
+    inner = word.removeprefix("[").removesuffix("]")
+    return [item.strip(" '\"") for item in inner.split(",")] if inner else []
+
+
+def decode(option_type: Any, value: Any) -> Any:
+    """Convert `value`, from YAML or text, to the declared type; raises one of several errors if it is invalid.
+
+    Unlike draccus, refuses a boolean as a number or text, NaN as a number, and "" as a path (the current folder).
+    """
+    import draccus  # imported here because help does not need it
+
+    some = without_none(option_type)
+    if option_type is Any:
+        return parse_yaml(value)
+    if hasattr(some, "parse") and isinstance(value, str):
+        return some.parse(value)
+    if some == list[Path] and isinstance(value, str):
+        value = [value]
+    if some == NameOrPath:
+        return typed(_expand(draccus.decode(str, value)))
+    decoded: Any = draccus.decode(option_type, value)
+    if decoded != decoded or (isinstance(value, bool) and some is not bool) or (some is Path and value == ""):
+        raise ValueError
+    return [_expand(item) for item in decoded] if isinstance(decoded, list) else _expand(decoded)
+
+
+def _expand(value: Any) -> Any:
+    """Expand the tilde in a path, such as `~/x`, `carry:~/x` and `mesh:~/x`: shells do so only in a word of its own."""
+    if isinstance(value, str):
+        return re.sub(r"^(\w+:)?~/", lambda found: f"{found[1] or ''}{Path.home()}/", value)
+    return value.expanduser() if isinstance(value, Path) else value
+
+
+def without_none(option_type: Any) -> Any:
+    """Return `X` of `X | None`, and any other type as it is."""
+    if typing.get_origin(option_type) not in (Union, types.UnionType):
+        return option_type
+    return functools.reduce(operator.or_, (one for one in typing.get_args(option_type) if one is not types.NoneType))
+
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 _EXPECTED = "a YAML file of options"
@@ -160,13 +356,13 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
 def _build(cls: Any, values: Mapping[tuple[str, ...], Any], path: tuple[str, ...] = ()) -> Any:
     """Return an instance of `cls`. values: of its options, by path."""
     arguments: dict[str, Any] = {}
-    for field in dataclasses.fields(cls):
-        here, kind = (*path, field.name), type_of(cls, field)
-        if "given" in field.metadata:
+    for declared in dataclasses.fields(cls):
+        here, kind = (*path, declared.name), type_of(cls, declared)
+        if "given" in declared.metadata:
             raw = {inner[-1]: value for inner, value in values.items() if inner[:-1] == here}
-            arguments[field.name] = default_of(field) | raw
+            arguments[declared.name] = default_of(declared) | raw
         else:
-            arguments[field.name] = _build(kind, values, here) if dataclasses.is_dataclass(kind) else values[here]
+            arguments[declared.name] = _build(kind, values, here) if dataclasses.is_dataclass(kind) else values[here]
     return cls(**arguments)
 
 

@@ -21,11 +21,10 @@ import pyarrow.parquet as pq
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.atomic import new_folder
+from manip_il.data.atomic import DATASET, new_folder
 from manip_il.data.camera import decode_picture
 from manip_il.data.dataset import EpisodeData, Own
 from manip_il.data.info import PICTURES, Info, read_info, reading
-from manip_il.data.ownership import DATASET
 from manip_il.data.parquet_files import Column, ParquetFiles, to_table
 from manip_il.data.schema import features
 from manip_il.data.statistics import (

@@ -24,8 +24,7 @@ from manip_il.evaluation.runner import FOLDER, episode_hold, episode_result, mea
 from manip_il.evaluation.runner import evaluate as run_episodes
 from manip_il.evaluation.side import Side
 from manip_il.evaluation.suites import suite_conditions
-from manip_il.learn.checkpoint import Checkpoint
-from manip_il.learn.policy_folder import policy_folder
+from manip_il.learn.checkpoint import Checkpoint, policy_folder
 from manip_il.mdp import Episode
 from manip_il.option import NameOrPath, make_options
 from manip_il.progress import Progress

@@ -29,7 +29,7 @@ from manip_il.sim.config import CAMERAS, FILM
 from manip_il.sim.render import framed_picture
 from manip_il.sim.scene import PREFIX
 from manip_il.sim.world import Scene, World
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 from manip_il.worlds.table import make_config
 
 FILE_NAME = "check.json"

@@ -14,7 +14,7 @@ from manip_il.caching import PerThread
 from manip_il.collect.job import HOLD, RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.data.json_lines import append_line, read_lines
+from manip_il.data.atomic import append_line, read_lines
 from manip_il.errors import MismatchError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult, EvalSettings

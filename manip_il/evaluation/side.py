@@ -9,12 +9,12 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from manip_il.data.json_lines import read_lines
+from manip_il.data.atomic import read_lines
 from manip_il.errors import UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult, require_equal
 from manip_il.evaluation.rounds import METRICS_FILE, History, Round, Rule, history
 from manip_il.evaluation.tables import DAGGER
-from manip_il.learn.policy_folder import find_policy
+from manip_il.learn.checkpoint import find_policy
 from manip_il.worlds.config import EnvConfig
 
 _SEED_FOLDER = re.compile(r"seed_(\d+)")

@@ -43,8 +43,8 @@ from manip_il.caching import cached_per_thread
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.mdp import F64
+from manip_il.robots.geometry import rotation_vector
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import rotation_vector
 from manip_il.robots.table import get_robot
 from manip_il.worlds.contract import GRIPPERS, JOINT_TARGETS, EnvironmentSpec
 

@@ -18,8 +18,7 @@ from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
 from manip_il.data.camera import decode
-from manip_il.data.dataset import Dataset, joined_columns
-from manip_il.data.joined import JoinedDatasets
+from manip_il.data.dataset import Dataset, JoinedDatasets, joined_columns
 from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, TASK_INDEX, TIMESTAMP
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics

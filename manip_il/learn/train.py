@@ -1,6 +1,8 @@
 """Behaviour cloning of any policy, LeRobot's or ours, with its optimiser, schedule, processors and checkpoints.
 
 The data are in memory, so that a batch is one gather per column; a batch depends only on seed and step.
+
+Train a policy on datasets: behaviour cloning.
 """
 
 from __future__ import annotations
@@ -28,19 +30,19 @@ from lerobot.scripts.lerobot_train import update_policy
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from lerobot.utils.random_utils import set_seed
 
-from manip_il.data.dataset import Dataset
-from manip_il.data.joined import JoinedDatasets
-from manip_il.errors import NotFiniteError
+from manip_il.data.atomic import output_of, require_ours
+from manip_il.data.dataset import Dataset, JoinedDatasets
+from manip_il.errors import NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import Augment, Order, generator_of, pictures_to_float
-from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
+from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line, with_folder
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.lerobot_config import lerobot_options, set_features
+from manip_il.learn.lerobot_config import lerobot_options, policy_config, set_features
 from manip_il.learn.lerobot_policy import build_policy, build_processors, load_processors
 from manip_il.learn.names import OWN_SPACE, PLAIN
 from manip_il.learn.network import threads
-from manip_il.learn.samples import Batch, Samples, load_data
+from manip_il.learn.samples import Batch, Samples, load_data, rabc_weights
 from manip_il.learn.sources import check_same_sources, input_columns, recorded_look, row_weights
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
@@ -52,6 +54,9 @@ from manip_il.learn.training_state import (
     write_own_files,
 )
 from manip_il.mdp import F64, I64
+from manip_il.option import make_options
+from manip_il.progress import Progress
+from manip_il.seeding import stream_base
 
 _METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")  # metrics that LeRobot's `update_policy` sets
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
@@ -308,3 +313,69 @@ def _accelerator(policy: PreTrainedConfig) -> Accelerator:
         cpu=policy.device == "cpu",
         kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=not ours, broadcast_buffers=not ours)],
     )
+
+
+Data = Dataset | Path | str
+
+
+def train(
+    datasets: Data | Sequence[Data],
+    output_dir: Path | str,
+    *,
+    seed: int = 0,
+    shares: Sequence[float] = (),
+    weights: Path | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Checkpoint:
+    """Fit a policy to the labels of one or more datasets.
+
+    Args:
+        datasets: The datasets, or their folders.
+        output_dir: The folder for checkpoints and metrics.
+        seed: 0 to 1000.
+        shares: Share of the samples from each dataset; by default its share of the frames.
+        weights: `rabc.parquet` of the only dataset, by which its frames are drawn.
+        resume: Whether to continue the fit in the folder.
+        progress: Follows the fit.
+        options: Fields of `FitConfig`, such as `policy={"type": "mlp", "width": 128}` and `steps`.
+
+    Returns:
+        The last checkpoint.
+
+    Raises:
+        UsageError: for an option that is unknown or invalid, or a folder with other files.
+        ManipError: for data that do not fit the policy.
+    """
+    progress = progress or Progress()
+    given = (datasets,) if isinstance(datasets, Data) else datasets
+    folder = Path(output_dir).expanduser()
+    require_ours(folder, output_of("Train"))
+    opened = [one if isinstance(one, Dataset) else Dataset.open(Path(one).expanduser()) for one in given]
+    options["policy"] = with_folder(options.get("policy", {}))
+    config = make_options(FitConfig, seed=stream_base("training", seed), **options)
+    drawn = None if weights is None else _frame_weights(weights, opened, config)
+    pictures = sum(len(one) * len(one.cameras) for one in opened) if config.takes_images else 0
+    progress.start("decode pictures, once", pictures)
+    trainer = Trainer(
+        opened,
+        config,
+        folder,
+        shares=shares,
+        weights=drawn,
+        resume=resume,
+        on_start=progress.started,
+        on_frames=progress.step,
+    )
+    progress.start(f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps)
+    return Checkpoint.open(trainer.fit(progress.log))
+
+
+def _frame_weights(path: Path, datasets: Sequence[Dataset], config: FitConfig) -> F64:
+    if len(datasets) > 1:
+        raise UsageError("weights are for the frames of one dataset; give one dataset")
+    [dataset] = datasets
+    episodes = dataset.columns(["episode_index"])["episode_index"].astype("int64")
+    ahead = getattr(policy_config(config), "chunk_size", None) or round(dataset.fps)
+    return rabc_weights(path, episodes, ahead)

@@ -22,9 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manip_il import checks
-from manip_il.data.atomic import new_folder, write_file
-from manip_il.data.json_lines import Record, append_line, read_lines
-from manip_il.data.ownership import CHECKPOINT
+from manip_il.data.atomic import CHECKPOINT, Record, append_line, new_folder, read_lines, write_file
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.learn.checkpoint import META_FILE, Origin
 

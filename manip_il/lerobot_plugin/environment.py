@@ -22,7 +22,7 @@ from manip_il.sim.config import CAMERAS, CameraConfig
 from manip_il.sim.env import ManipEnv
 from manip_il.tasks import ENV_IDS, TASK_IDS
 from manip_il.worlds.config import EnvConfig as SimConfig
-from manip_il.worlds.ladder.envs import parts_of
+from manip_il.worlds.ladder.world import parts_of
 from manip_il.worlds.table import complete, env_spec
 
 TASKS = {env_id.removeprefix("manip_il/"): names for env_id, names in ENV_IDS.items()}

@@ -12,11 +12,10 @@ import numpy as np
 
 from manip_il.errors import UsageError
 from manip_il.mdp import F64
-from manip_il.robots.geometry import Body, at_tip, nearest, outline
+from manip_il.robots.geometry import Body, at_tip, hand_down, nearest, outline, rotation_vector
 from manip_il.robots.gripper import finger_geoms, set_time_step
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import EndEffector, Robot
-from manip_il.robots.rotations import hand_down, rotation_vector
 from manip_il.robots.spec import arm_model, arm_spec, bare_spec, require
 
 FORCE = 200.0  # torque limit of an arm joint whose model sets none [N m]

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
+from manip_il.robots.geometry import angle_between, rotation_matrix, rotation_vector, yaw_ahead
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import angle_between, rotation_matrix, rotation_vector, yaw_ahead
 from manip_il.robots.spec import arm_model
 
 _POSITION_COST = 1.0  # [1/m]

@@ -23,9 +23,8 @@ from manip_il.checks import open_outside, without_link
 from manip_il.mdp import F64
 from manip_il.robots import HERE, ROBOTS
 from manip_il.robots.files import ModelFiles
-from manip_il.robots.geometry import CLEARANCE, Body
+from manip_il.robots.geometry import CLEARANCE, Body, angle_between, angle_off_vertical, hand_down, off_yaw
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import angle_between, angle_off_vertical, hand_down, off_yaw
 from manip_il.robots.spec import arm_spec, model_bytes
 from manip_il.robots.table import get_robot
 

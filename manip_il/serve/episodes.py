@@ -9,17 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from manip_il.collect.edits import SERVED
+from manip_il.data.atomic import EPISODES, require_ours
 from manip_il.data.build import Recording
 from manip_il.data.episodes import to_episode
 from manip_il.data.journal import Journal, list_seeds
-from manip_il.data.ownership import EPISODES, require_ours
 from manip_il.errors import UsageError
 from manip_il.mdp import Actor, Transition
 from manip_il.seeding import BLOCK, stream_seeds
 from manip_il.serve.station import Mover, Read, Station
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.envs import env_of
 from manip_il.worlds.ladder.expert import LadderExpert
+from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import env_fingerprint, env_spec
 
 

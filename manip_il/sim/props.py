@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.robots.rotations import turn_about_z
+from manip_il.robots.geometry import turn_about_z
 from manip_il.seeding import rng_for
 from manip_il.sim.world import GOAL, Scene
 

@@ -13,10 +13,9 @@ import numpy as np
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.action_space import ActionSpace, ServoUnits
-from manip_il.robots.geometry import outline
+from manip_il.robots.geometry import angle_across, outline, yaw_ahead
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.robot import TABLE_BEYOND, CameraPose, Robot
-from manip_il.robots.rotations import angle_across, yaw_ahead
 from manip_il.robots.spec import add_wrist_camera, arm_spec, copy_options
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM

@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64, I64
+from manip_il.sim.conditions import OWN, RANGES
 from manip_il.sim.config import CAMERAS
-from manip_il.sim.ranges import OWN, RANGES
 from manip_il.sim.shape import ObjectShape, contact
 
 GEOMS = {

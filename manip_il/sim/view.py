@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.mdp import F64
-from manip_il.robots.rotations import turn_about_z
+from manip_il.robots.geometry import turn_about_z
 from manip_il.sim.config import CAMERAS, Look
 from manip_il.sim.scene import TABLE, camera_id
 from manip_il.sim.variation import part, seen_objects

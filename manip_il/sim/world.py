@@ -18,10 +18,10 @@ import numpy as np
 from manip_il.errors import ManipError, MismatchError, UnknownName
 from manip_il.mdp import F64, I64
 from manip_il.robots.action_space import ActionSpace
+from manip_il.robots.geometry import angle_across, angle_ahead, angle_from_down, off_yaw, yaw_ahead
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.reach import Reach, reach_of
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import angle_across, angle_ahead, angle_from_down, off_yaw, yaw_ahead
 from manip_il.sim import variation as variations
 from manip_il.sim.rests import Hull
 from manip_il.sim.shape import ANY

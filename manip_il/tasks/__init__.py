@@ -40,4 +40,4 @@ def register_envs() -> None:
     named |= {env_id: {"task": task} for env_id, task in TASK_IDS.items()} | {ANY_ID: {}}
     for env_id, kwargs in named.items():
         if env_id not in gymnasium.registry:
-            gymnasium.register(env_id, entry_point="manip_il.worlds.ladder.envs:make_env", kwargs=kwargs)
+            gymnasium.register(env_id, entry_point="manip_il.worlds.ladder.world:make_env", kwargs=kwargs)

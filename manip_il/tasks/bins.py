@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import mujoco
 
 from manip_il.mdp import F64
-from manip_il.robots.rotations import hand_down
+from manip_il.robots.geometry import hand_down
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of

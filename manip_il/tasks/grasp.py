@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, cast
 import mujoco
 
 from manip_il.mdp import F64
-from manip_il.robots.rotations import angle_off_vertical
+from manip_il.robots.geometry import angle_off_vertical
 from manip_il.sim.rests import DEEPEST, LEAST_ROOM, Hull
 from manip_il.sim.world import World
 

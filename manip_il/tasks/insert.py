@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.robots.rotations import angle_across, angle_ahead, angle_between, angle_off_vertical
+from manip_il.robots.geometry import angle_across, angle_ahead, angle_between, angle_off_vertical
 from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of, once_per_state

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.robots.rotations import hand_down
+from manip_il.robots.geometry import hand_down
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import CLOSING, HOVER, grasp_of, is_inside, lie_of, share

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from manip_il.mdp import F64
+from manip_il.robots.geometry import angle_across, angle_between, rotation_matrix, rotation_vector, turn_about_z
 from manip_il.robots.reach import ARRIVES, reach_of
-from manip_il.robots.rotations import angle_across, angle_between, rotation_matrix, rotation_vector, turn_about_z
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import SCENES_KEPT, Scene, World
 from manip_il.tasks.grasp import OPEN_SLACK, is_inside, lie_of, once_per_state, share

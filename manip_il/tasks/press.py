@@ -7,7 +7,7 @@ import math
 import mujoco
 import numpy as np
 
-from manip_il.robots.rotations import hand_down
+from manip_il.robots.geometry import hand_down
 from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.ladder import CLOSED, LiftProfile, nearness, rise_first

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.robots.rotations import hand_down
+from manip_il.robots.geometry import hand_down
 from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.grasp import share

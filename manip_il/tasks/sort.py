@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
+from manip_il.robots.geometry import angle_ahead, angle_from_down, hand_down
 from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, OVER_WALL, WALL, add_bin, drop_place, drop_rungs, is_in, rise_over

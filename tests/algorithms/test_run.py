@@ -15,8 +15,8 @@ from manip_il.algorithms.results import Result, best_result
 from manip_il.algorithms.rounds import round_folder
 from manip_il.algorithms.run import Run
 from manip_il.collect.workers import Engine
+from manip_il.data.atomic import read_lines
 from manip_il.data.dataset import Dataset, joined_columns
-from manip_il.data.json_lines import read_lines
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Actor, Episode

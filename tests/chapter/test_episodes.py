@@ -7,7 +7,7 @@ import pytest
 
 from manip_il.chapter.episodes import ActionRange, Lockstep, RobotEpisode
 from manip_il.learn.action_spaces import Conversion
-from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import make_config
 
 ENV = make_config("fetch", "reach")

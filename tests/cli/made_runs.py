@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.imitation import DaggerOptions
 from manip_il.cli.outputs import save_options
 from manip_il.collect.job import HOLD
 from manip_il.data import schema
-from manip_il.data.json_lines import append_line
+from manip_il.data.atomic import append_line
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.learn.checkpoint import META_FILE, Origin
 from manip_il.mdp import Episode

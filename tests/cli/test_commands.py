@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 from manip_il.cli.main import load, main
-from manip_il.cli.options import options_of
-from manip_il.cli.parsing import from_yaml, parse
+from manip_il.cli.parsing import from_yaml, options_of, parse
+from manip_il.data.atomic import read_lines
 from manip_il.data.dataset import Dataset
-from manip_il.data.json_lines import read_lines
 from manip_il.evaluation.results import EvalResult
 
 from .made_runs import files

@@ -110,7 +110,7 @@ def test_a_mistake_is_one_line_with_the_nearest_name_and_leaves_nothing(tmp_path
 def test_the_environments_are_registered_whatever_is_imported_first():
     code = "import gymnasium, manip_il; print(gymnasium.spec('manip_il/PandaPickPlace-v0').entry_point)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "manip_il.worlds.ladder.envs:make_env\n"
+    assert done.stdout == "manip_il.worlds.ladder.world:make_env\n"
 
 
 def test_the_package_shows_what_a_user_wants_and_alone_loads_no_simulator():

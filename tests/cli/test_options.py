@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manip_il.cli.options import Given, Open, options_of, word
-from manip_il.cli.options import given as given_of
-from manip_il.cli.parsing import dump_yaml, from_layers, from_yaml, parse
+from manip_il.cli.parsing import Given, Open, dump_yaml, from_layers, from_yaml, options_of, parse, word
+from manip_il.cli.parsing import given as given_of
 from manip_il.errors import UsageError
 from manip_il.option import option
 

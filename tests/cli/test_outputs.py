@@ -9,14 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.cli.imitation import DatasetGroup, RecordOptions, SourceGroup, TrainOptions
 from manip_il.cli.main import main
 from manip_il.cli.outputs import CONFIG_FILE, OutputFile, check_same_options, prepare_output, save_options
 from manip_il.cli.parsing import CONFIG_HEADER
-from manip_il.cli.record import DatasetGroup, RecordOptions
-from manip_il.cli.train import SourceGroup, TrainOptions
-from manip_il.data.atomic import exclusive, write_file
+from manip_il.data.atomic import DATASET, EPISODES, exclusive, output_of, write_file
 from manip_il.data.lerobot_layout import OURS
-from manip_il.data.ownership import DATASET, EPISODES, output_of
 from manip_il.errors import FolderExistsError, MismatchError, UsageError
 
 from .made_runs import files

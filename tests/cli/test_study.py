@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.imitation import DaggerOptions
 from manip_il.cli.main import main
-from manip_il.cli.run.compare import read_plan
+from manip_il.cli.run.imitation import read_plan
 from manip_il.errors import MismatchError
 
 from .made_runs import make_run
@@ -48,7 +48,7 @@ def runs(policy, monkeypatch) -> list[DaggerOptions]:
         successes = (0.2, 0.4, 0.6) if options.method == "dagger" else (0.2, 0.2, 0.4)
         make_run(options.output_dir, policy, options.settings["seed"], successes)
 
-    monkeypatch.setattr("manip_il.cli.run.compare.run_dagger", run)
+    monkeypatch.setattr("manip_il.cli.run.imitation.run_dagger", run)
     return asked
 
 

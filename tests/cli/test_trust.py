@@ -9,16 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.imitation import DaggerOptions
 from manip_il.cli.main import load, main
-from manip_il.cli.options import options_of
-from manip_il.cli.parsing import dump_yaml, parse
-from manip_il.cli.run.compare import read_plan
-from manip_il.cli.run.dagger import dagger_config
+from manip_il.cli.parsing import dump_yaml, options_of, parse
+from manip_il.cli.run.imitation import dagger_config, read_plan
 from manip_il.errors import ManipError, UsageError
+from manip_il.learn.checkpoint import find_policy, with_folder
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options
-from manip_il.learn.policy_folder import find_policy, with_folder
 
 from ..damage import edit_json
 from .made_runs import make_eval, make_policy, make_run

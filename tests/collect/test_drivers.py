@@ -12,7 +12,7 @@ from manip_il.collect.drivers import PolicyDriver, RandomDriver, Setting
 from manip_il.collect.query import Query, drawn_step
 from manip_il.collect.rollout import Turn
 from manip_il.mdp import Actor, Label, Observation, State
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 
 STATE = State(np.zeros(4), np.zeros(3))
 SCALE = np.array([0.1, 0.1, 0.08])

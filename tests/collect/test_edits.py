@@ -14,9 +14,11 @@ from kept import label_all
 
 from manip_il import Expert
 from manip_il.collect.edits import (
+    CHUNK,
     SERVED,
     EditSource,
     EditTarget,
+    Scenes,
     open_source,
     redraw_dataset,
     relabel_dataset,
@@ -24,7 +26,6 @@ from manip_il.collect.edits import (
     render_states,
 )
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.scenes import CHUNK, Scenes
 from manip_il.collect.workers import map_in_order
 from manip_il.data import schema
 from manip_il.data.dataset import Dataset
@@ -37,7 +38,7 @@ from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.variation import part
 from manip_il.sim.world import World
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.envs import env_of, scene_of
+from manip_il.worlds.ladder.world import env_of, scene_of
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config, make_expert
 
 from ..damage import digests

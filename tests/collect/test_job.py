@@ -19,7 +19,7 @@ from manip_il.mdp import Actor, Episode, State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.events import STANDARD
-from manip_il.worlds.ladder.envs import env_of, scene_of
+from manip_il.worlds.ladder.world import env_of, scene_of
 from manip_il.worlds.table import env_spec, make_config
 
 from ..learn.tiny_policies import write_checkpoint

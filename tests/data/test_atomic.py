@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from manip_il.data.atomic import exclusive, new_folder, write_file
-from manip_il.data.ownership import CHECKPOINT, DATASET
+from manip_il.data.atomic import CHECKPOINT, DATASET, exclusive, new_folder, write_file
 from manip_il.errors import FolderExistsError, ManipError, UsageError
 
 

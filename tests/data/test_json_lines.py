@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.data.json_lines import append_line, read_lines
+from manip_il.data.atomic import append_line, read_lines
 from manip_il.errors import ManipError
 
 

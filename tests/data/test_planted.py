@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.data.json_lines import append_line
+from manip_il.data.atomic import append_line
 from manip_il.errors import ManipError
 from manip_il.learn.training_state import json_lines
 

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from manip_il.cli.main import load
-from manip_il.cli.options import options_of
+from manip_il.cli.parsing import options_of
 from manip_il.worlds.config import WORLDS
 
 from .pages import command_of

@@ -12,7 +12,7 @@ from manip_il.collect.workers import Engine
 from manip_il.evaluation.certify import Case, Certificate, Row, certify, count_episodes, draw_moment
 from manip_il.evaluation.intervals import wilson_interval
 from manip_il.sim.events import Perturbation
-from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.ladder.world import make_env, scene_of
 from manip_il.worlds.table import env_fingerprint, make_config
 
 HORIZON = 50

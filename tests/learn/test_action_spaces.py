@@ -13,8 +13,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
 
-from manip_il.data.dataset import Dataset
-from manip_il.data.joined import JoinedDatasets
+from manip_il.data.dataset import Dataset, JoinedDatasets
 from manip_il.data.schema import ACTION, STATE
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn import action_spaces

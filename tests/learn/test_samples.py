@@ -15,8 +15,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
-from manip_il.data.dataset import Dataset
-from manip_il.data.joined import JoinedDatasets
+from manip_il.data.dataset import Dataset, JoinedDatasets
 from manip_il.learn.batches import to_float
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.samples import Windows, windows_of

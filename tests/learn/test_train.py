@@ -15,9 +15,8 @@ import pytest
 import torch
 
 from manip_il.cli.main import main
-from manip_il.data.json_lines import read_lines
+from manip_il.data.atomic import UNFINISHED_MARK, read_lines
 from manip_il.data.lerobot_layout import OURS
-from manip_il.data.ownership import UNFINISHED_MARK
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig

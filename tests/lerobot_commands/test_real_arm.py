@@ -22,7 +22,7 @@ from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, STATE
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.robots.table import get_robot
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 
 from ..so_follower import Camera, arm, record, recorders_features
 

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 
 from manip_il.chapter.rewards.max_entropy import SoftPlan
-from manip_il.tasks.carry.paths import Demonstration, PathProblem, cheapest_path, plan
+from manip_il.tasks.carry.grid import Demonstration, PathProblem, cheapest_path, plan
 
 
 def grid(rng: np.random.Generator, shape: tuple[int, ...] = (6, 5), things: int = 2, step: float = 1.0) -> PathProblem:

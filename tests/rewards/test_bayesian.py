@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from manip_il.chapter.rewards.bayesian import Choices, draw_posterior, fit, sample
-from manip_il.tasks.carry.paths import Demonstration, PathProblem, open_features, rivals
+from manip_il.tasks.carry.grid import Demonstration, PathProblem, open_features, rivals
 from tests.rewards.grids import acyclic, all_paths, demonstrations, excess
 
 TRUTH = np.array([1.0, 4.0, 2.0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from manip_il.chapter.rewards.max_entropy import fit, loss_of, soft_plan
-from manip_il.tasks.carry.paths import Demonstration
+from manip_il.tasks.carry.grid import Demonstration
 from tests.rewards.grids import draw, grid
 
 WEIGHTS = np.array([3.5, 2.0, 5.0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from manip_il.chapter.rewards.max_margin import fit, loss_of
-from manip_il.tasks.carry.paths import plan
+from manip_il.tasks.carry.grid import plan
 from tests.rewards.grids import demonstrations, excess
 
 TRUTH = np.array([1.0, 4.0, 2.0])

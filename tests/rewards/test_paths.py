@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from manip_il.tasks.carry.paths import cheapest_path, plan
+from manip_il.tasks.carry.grid import cheapest_path, plan
 from tests.rewards.grids import acyclic, all_paths, grid
 
 

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from manip_il.errors import MismatchError, NotFiniteError
 from manip_il.robots.action_space import ActionSpace
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 
 from ..tables import every_robot
 

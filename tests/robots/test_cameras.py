@@ -10,7 +10,7 @@ import pytest
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import pictures, projections
 from manip_il.sim.scene import camera_id
-from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.ladder.world import make_env, scene_of
 
 from .own import tree_of, write
 

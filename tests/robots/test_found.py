@@ -11,10 +11,10 @@ import yaml
 
 from manip_il.collect.job import RolloutJob
 from manip_il.errors import UsageError
+from manip_il.robots.geometry import angle_across, angle_off_vertical
 from manip_il.robots.gripper import sweep
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import FOUND, Robot
-from manip_il.robots.rotations import angle_across, angle_off_vertical
 from manip_il.robots.table import get_robot, read_robot
 from manip_il.seeding import stream_seeds
 from manip_il.worlds.table import make_config

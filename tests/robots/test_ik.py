@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from manip_il.robots import ik
+from manip_il.robots.geometry import hand_down
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import hand_down
 from manip_il.robots.spec import arm_model
 from manip_il.robots.table import get_robot
 

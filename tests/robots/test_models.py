@@ -15,8 +15,8 @@ import pytest
 
 from manip_il.errors import UsageError
 from manip_il.robots.files import ModelFiles
+from manip_il.robots.geometry import rotation_matrix
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import rotation_matrix
 from manip_il.robots.spec import arm_model, arm_spec, load
 from manip_il.robots.suggest import suggest
 from manip_il.robots.table import get_robot

@@ -12,11 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.robots import HERE, reach
-from manip_il.robots.geometry import Body
+from manip_il.robots.geometry import Body, angle_between, hand_down, off_yaw
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.reach import ARRIVES, STRETCH, Reach, reach_of
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import angle_between, hand_down, off_yaw
 from manip_il.robots.table import get_robot
 from manip_il.tasks.grasp import LEAN
 

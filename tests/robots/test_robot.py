@@ -17,7 +17,7 @@ from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_model, arm_spec
 from manip_il.robots.table import get_robot
 from manip_il.sim.scene import PREFIX
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 from manip_il.worlds.table import env_fingerprint, make_config
 
 from ..scenes import drive, started, world_at_home

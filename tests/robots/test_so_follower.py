@@ -14,7 +14,7 @@ from manip_il.robots.table import get_robot
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import ManipEnv
 from manip_il.worlds.contract import SERVOS
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 from manip_il.worlds.table import described_env, env_spec, make_config
 
 from ..scenes import started

@@ -11,7 +11,7 @@ import pytest
 from manip_il.robots import ROBOTS
 from manip_il.sim.scene import PREFIX, camera_id
 from manip_il.sim.world import World
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 
 from .own import EXAMPLES
 

@@ -21,7 +21,7 @@ from manip_il.data.journal import list_episodes, read_journal
 from manip_il.mdp import Actor, Episode
 from manip_il.serve.config import SessionConfig
 from manip_il.serve.station import Station
-from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import make_config
 
 pytestmark = pytest.mark.slow

@@ -21,7 +21,7 @@ from manip_il.mdp import F64
 from manip_il.serve import operator, session
 from manip_il.serve.config import ServoConfig, SessionConfig
 from manip_il.serve.station import Station
-from manip_il.worlds.ladder.envs import env_of
+from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import make_config
 
 from ..cli.made_runs import files

@@ -17,7 +17,7 @@ from manip_il.sim.world import GOAL
 from manip_il.tasks import ENV_IDS, TASK_IDS, register_envs
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 from ..scenes import SEED, bits, started, still
 from ..tables import SCENES, every_robot, every_scene, every_task

@@ -10,7 +10,7 @@ import pytest
 from manip_il import Expert
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.env import ManipEnv, environment_state_names
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 from ..tables import every_robot, every_scene, every_scene_with_a_cube
 

@@ -10,7 +10,7 @@ from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.sort import asked
 from manip_il.tasks.table import TASKS
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 from ..scenes import has_goal, started
 from ..tables import every_scene, every_scene_with_cubes

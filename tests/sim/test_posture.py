@@ -7,7 +7,7 @@ import numpy as np
 from manip_il.sim import events
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import ManipEnv
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 from ..scenes import started
 from ..tables import every_robot, every_scene

@@ -13,7 +13,7 @@ from manip_il.sim.config import CAMERAS
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.props import props
 from manip_il.sim.variation import part
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 from ..scenes import SEED, bits, started, still
 from ..tables import every_robot

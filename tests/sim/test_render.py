@@ -18,7 +18,7 @@ from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import GOAL
 from manip_il.tasks.starts import UPRIGHT
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 
 from ..scenes import SEED, started
 

@@ -10,7 +10,7 @@ from manip_il.robots.table import get_robot
 from manip_il.sim.scene import build_scene
 from manip_il.tasks.objects import CUBE_HALF
 from manip_il.tasks.table import TASKS
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 
 from ..scenes import cube, drive_until, half_height, in_hand, started, still
 from ..tables import every_robot, every_scene

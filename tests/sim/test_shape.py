@@ -9,7 +9,7 @@ from manip_il.errors import UsageError
 from manip_il.sim.shape import CUBE, LIGHTEST, ObjectShape
 from manip_il.sim.world import World
 from manip_il.tasks.table import get_task
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 from manip_il.worlds.table import make_config
 
 

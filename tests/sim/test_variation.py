@@ -17,7 +17,7 @@ from manip_il.sim.variation import (
     with_drawn,
 )
 from manip_il.sim.world import World
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 
 WHERE_IT_WAS_MADE = {"body_pos", "qpos0", "qpos_spring", "cam_poscom0", "light_poscom0"}  # which no start keeps
 NO_MOTORS = np.array([], dtype=np.int64)

@@ -7,7 +7,7 @@ import pytest
 
 from manip_il.errors import RenderError, UsageError
 from manip_il.sim.window import Clock
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 
 @pytest.mark.parametrize("display", ["", ":99"])

@@ -10,7 +10,7 @@ from manip_il.robots.spec import model_bytes
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.pick_place import OBJECT
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 
 from ..scenes import world_at_home
 from ..tables import WITH_A_CUBE, every_scene

@@ -26,7 +26,7 @@ from manip_il.tasks import NAMES
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS, get_task
 from manip_il.worlds.ladder import world
-from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.ladder.world import make_env, scene_of
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..scenes import has_goal, sizes_of, started, still

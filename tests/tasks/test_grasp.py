@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.collect.job import RolloutJob
-from manip_il.robots.rotations import hand_down
+from manip_il.robots.geometry import hand_down
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import environment_state_names
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import Lie, lie_of
 from manip_il.tasks.pick_place import OBJECT, observe_object
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 from manip_il.worlds.table import make_config
 
 from ..scenes import SEED, started

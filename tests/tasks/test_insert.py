@@ -14,7 +14,7 @@ from manip_il.sim.world import World
 from manip_il.tasks.insert import APART
 from manip_il.tasks.peg import HOLE, PEG, lower_end
 from manip_il.tasks.table import TASKS
-from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.ladder.world import make_env, scene_of
 
 from ..tables import every_robot
 

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from manip_il.robots.geometry import angle_ahead, angle_between, angle_from_down, hand_down
 from manip_il.robots.reach import Reach
-from manip_il.robots.rotations import angle_ahead, angle_between, angle_from_down, hand_down
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import Pose
 from manip_il.tasks.grasp import HOVER, LEAN, MAX_TILT, OPEN_SLACK, grasp_of, lie_of

@@ -23,7 +23,7 @@ from manip_il.sim.rests import LEAST_ROOM
 from manip_il.sim.shape import DENSITY, LIGHTEST, ObjectShape
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
-from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.ladder.world import make_env, scene_of
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config, stored_config, world_of
 from tests.meshes import MESHES, write_mesh
 

@@ -22,7 +22,7 @@ from manip_il.robots import table as robots
 from manip_il.sim.points import point_names
 from manip_il.tasks import table
 from manip_il.tasks.table import get_task
-from manip_il.worlds.ladder.envs import scene_of
+from manip_il.worlds.ladder.world import scene_of
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config, world_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "new-task.md"

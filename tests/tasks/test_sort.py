@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from manip_il import Expert
+from manip_il.collect.edits import SceneDrawer, Scenes
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.scenes import SceneDrawer, Scenes
 from manip_il.mdp import State
 from manip_il.sim.env import environment_state_names
 from manip_il.sim.events import move_object
@@ -18,7 +18,7 @@ from manip_il.sim.world import World
 from manip_il.tasks.sort import BINS, COLOURS, PITCH, SENTENCES, asked
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 from manip_il.worlds.table import make_config
 
 from ..scenes import SEED, drive_until, started

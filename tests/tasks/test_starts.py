@@ -16,7 +16,7 @@ from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.starts import FROM_HAND, FROM_HAND_SHARE
 from manip_il.tasks.table import TASKS, get_task
-from manip_il.worlds.ladder.envs import make_env, scene_of
+from manip_il.worlds.ladder.world import make_env, scene_of
 
 from ..scenes import SEED, half_height, has_goal
 from ..tables import every_scene, every_scene_that_grasps

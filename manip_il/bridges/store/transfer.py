@@ -32,9 +32,9 @@ from manip_il.bridges.store.manifest import (
 )
 from manip_il.bridges.store.objects import Objects
 from manip_il.data import atomic
+from manip_il.data.atomic import DATASET, EPISODES, POLICY, kind_of, output_of
 from manip_il.data.gate import check_arrived
 from manip_il.data.lerobot_layout import INFO
-from manip_il.data.ownership import DATASET, EPISODES, POLICY, kind_of, output_of
 from manip_il.errors import ManipError, UsageError
 
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://(.*[^/].*)")

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from manip_il.mdp import F64, I64
-from manip_il.tasks.carry.paths import Demonstration, add_rivals, rivals
+from manip_il.tasks.carry.grid import Demonstration, add_rivals, rivals
 
 Density = Callable[[F64], F64]  # log-densities (C,) at points (C, K)
 PRIOR = 300.0  # mean of a weight [1/m]

@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 
 from manip_il.errors import ManipError
 from manip_il.mdp import F64
-from manip_il.tasks.carry.paths import LENGTH, Demonstration, PathProblem, plan, stages
+from manip_il.tasks.carry.grid import LENGTH, Demonstration, PathProblem, plan, stages
 
 PRIOR = 300.0  # standard deviation of a weight [1/m]
 _MOST_STEPS = 200

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.tasks.carry.paths import LENGTH, Demonstration, cheapest_path, plan_edges, stages
+from manip_il.tasks.carry.grid import LENGTH, Demonstration, cheapest_path, plan_edges, stages
 
 MARGIN = 0.05  # margin per metre of path off the demonstration
 RIDGE = 1e-4  # factor of the penalty, half the squared weights

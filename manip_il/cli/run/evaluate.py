@@ -19,7 +19,7 @@ from manip_il.evaluation.measuring import evaluate, replay
 from manip_il.evaluation.results import FILE_NAME, EvalResult, merge_results
 from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, CameraConfig
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 
 def run_eval(options: EvalOptions) -> None:

@@ -6,9 +6,8 @@ from manip_il.cli.progress import say
 from manip_il.cli.transfer import ExportOptions
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError
-from manip_il.learn.checkpoint import read_config
+from manip_il.learn.checkpoint import find_policy, read_config
 from manip_il.learn.export import export_onnx
-from manip_il.learn.policy_folder import find_policy
 
 EXPORTABLE = ("mlp", "cnn")
 

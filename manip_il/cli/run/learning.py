@@ -9,15 +9,14 @@ from manip_il.algorithms.results import validation_report, validations
 from manip_il.chapter.config import LearningConfig
 from manip_il.chapter.learning import LearningRun
 from manip_il.chapter.reward import LearnedReward
-from manip_il.cli.learning import GailOptions, Learning, PpoOptions
+from manip_il.cli.chapter import GailOptions, Learning, PpoOptions
 from manip_il.cli.outputs import REPORT_FILE, about
 from manip_il.cli.progress import Stages, say
-from manip_il.cli.run.dagger import say_best
+from manip_il.cli.run.imitation import say_best
 from manip_il.collect.inputs import open_dataset
-from manip_il.data.json_lines import read_lines
+from manip_il.data.atomic import read_lines
 from manip_il.evaluation.rounds import METRICS_FILE
-from manip_il.learn.checkpoint import Origin
-from manip_il.learn.policy_folder import find_policy
+from manip_il.learn.checkpoint import Origin, find_policy
 from manip_il.learn.sources import check_same_sources
 from manip_il.progress import Progress
 from manip_il.worlds.contract import EnvironmentSpec

@@ -8,9 +8,8 @@ from manip_il.bridges.mcap.mapping import load_mapping
 from manip_il.cli.outputs import prepare_output, save_options
 from manip_il.cli.progress import progress, say
 from manip_il.cli.transfer import McapExportOptions, McapImportOptions
-from manip_il.data.atomic import new_folder
+from manip_il.data.atomic import new_folder, output_of
 from manip_il.data.dataset import Dataset
-from manip_il.data.ownership import output_of
 
 
 def run_mcap_export(options: McapExportOptions) -> None:

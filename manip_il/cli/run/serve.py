@@ -7,13 +7,12 @@ from pathlib import Path
 
 from manip_il.cli.outputs import save_options
 from manip_il.cli.progress import say
-from manip_il.cli.serve import ServeOptions
-from manip_il.data.atomic import exclusive
-from manip_il.data.ownership import output_of, require_ours
+from manip_il.cli.robots import ServeOptions
+from manip_il.data.atomic import exclusive, output_of, require_ours
 from manip_il.errors import UsageError
 from manip_il.evaluation.measuring import open_driver
 from manip_il.evaluation.suites import varied
-from manip_il.learn.policy_folder import find_policy
+from manip_il.learn.checkpoint import find_policy
 from manip_il.serve.config import LEADERS, SessionConfig
 from manip_il.serve.session import serve
 from manip_il.sim.window import has_display

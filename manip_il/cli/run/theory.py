@@ -9,9 +9,9 @@ from manip_il.chapter.theory.bounds import PROCESSES, curves
 from manip_il.chapter.theory.linear import drifts
 from manip_il.chapter.theory.report import FILE_NAME, Theory, slope_table, theory_report
 from manip_il.chapter.theory.shift import Shift, find_rounds, measure_shift
+from manip_il.cli.chapter import TheoryOptions
 from manip_il.cli.outputs import publish
 from manip_il.cli.progress import progress
-from manip_il.cli.theory import TheoryOptions
 from manip_il.evaluation.certify import certify, count_episodes
 from manip_il.evaluation.side import read_member
 

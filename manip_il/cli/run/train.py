@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 
+from manip_il.cli.imitation import RANK, TrainOptions
 from manip_il.cli.progress import Stages, say, say_next, set_quiet
-from manip_il.cli.train import RANK, TrainOptions
 from manip_il.collect.inputs import open_dataset, why_not_simulated
-from manip_il.learn.training import train
+from manip_il.learn.train import train
 
 
 def run_train(options: TrainOptions) -> None:

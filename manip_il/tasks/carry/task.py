@@ -18,8 +18,8 @@ import numpy as np
 from manip_il.errors import UsageError
 from manip_il.mdp import F64
 from manip_il.option import NameOrPath
+from manip_il.robots.geometry import hand_down
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import hand_down
 from manip_il.sim.shape import CUBE, ObjectShape
 from manip_il.sim.task import Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, Scene, World

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64, Label, State
+from manip_il.robots.geometry import turned_towards
 from manip_il.robots.ik import PoseProgram
-from manip_il.robots.rotations import turned_towards
 from manip_il.worlds.aloha.environment import AlohaEnv
 from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, Hand, HandTarget
 from manip_il.worlds.contract import Environment, Expert

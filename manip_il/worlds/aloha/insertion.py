@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.robots.rotations import angle_between
+from manip_il.robots.geometry import angle_between
 from manip_il.worlds.aloha.ladder import (
     ARM,
     PITCH,

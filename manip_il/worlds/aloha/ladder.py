@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.robots.rotations import angle_between, turned_towards
+from manip_il.robots.geometry import angle_between, turned_towards
 from manip_il.worlds.packaged import PackagedRung, always
 
 SIDES = ("left", "right")

@@ -9,8 +9,8 @@ import numpy as np
 
 from manip_il.errors import ManipError
 from manip_il.mdp import F64, Label, State
+from manip_il.robots.geometry import turned_towards
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.rotations import turned_towards
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import Target
 from manip_il.sim.world import Scene, World

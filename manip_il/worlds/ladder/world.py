@@ -1,39 +1,163 @@
-"""Our robots at our tasks, behind the contract of a world."""
+"""Our robots at our tasks, behind the contract of a world.
+
+New scenes from visited states: new goals, and new places of untouched objects.
+
+Scenes and environments by the names of robot and task.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, override
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.checks import check_unchanged
 from manip_il.mdp import F64, STATE_EXTRAS, State
+from manip_il.option import NameOrPath
 from manip_il.robots import ROBOTS
 from manip_il.robots.files import ModelFiles
+from manip_il.robots.robot import Robot
 from manip_il.robots.spec import model_bytes
 from manip_il.robots.table import get_robot, is_robot
 from manip_il.sim.conditions import Condition
-from manip_il.sim.config import CAMERAS, CameraConfig
+from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv, environment_state_names
 from manip_il.sim.mesh import mesh_path
 from manip_il.sim.points import point_names
 from manip_il.sim.props import VERSION as DRAWN
+from manip_il.sim.scene import Scene, build_scene
 from manip_il.sim.shape import MESH, ObjectShape, stored
-from manip_il.sim.task import phases
+from manip_il.sim.task import Task, phases
 from manip_il.sim.variation import with_drawn
+from manip_il.sim.world import World
 from manip_il.tasks import ENV_IDS
 from manip_il.tasks.table import TASKS, get_task, is_task, source_hash
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.contract import OPENINGS, SERVOS, Environment, EnvironmentSpec, Outcome, WorldKind
 from manip_il.worlds.fingerprint import environment_fingerprint
-from manip_il.worlds.ladder.envs import config_scene, parts_of
 from manip_il.worlds.ladder.expert import LadderExpert
-from manip_il.worlds.ladder.redraw import redrawn
+from manip_il.worlds.table import make_config
+
+
+def scene_of(robot: NameOrPath, task: NameOrPath, shape: NameOrPath = "") -> Scene:
+    """Return the compiled scene of a robot, a task and an object, as in `EnvConfig`.
+
+    Raises `UnknownName`, `UsageError`.
+    """
+    return build_scene(get_robot(robot), get_task(task, shape))
+
+
+def config_scene(config: EnvConfig) -> Scene:
+    """Return the compiled scene of an environment."""
+    return build_scene(*parts_of(config), config.physics_step)
+
+
+def env_of(config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> ManipEnv:
+    """Return the environment that these settings describe."""
+    return ManipEnv(*parts_of(config), config, cameras=cameras, conditions=conditions)
+
+
+def make_env(
+    robot: NameOrPath = EnvConfig.robot,
+    task: NameOrPath = EnvConfig.task,
+    *,
+    cameras: Sequence[str] = (),
+    image_size: tuple[int, int] = (128, 128),
+    look: Look | None = None,
+    render_mode: str | None = None,
+    conditions: Sequence[Condition] = (),
+    **settings: Any,
+) -> ManipEnv:
+    """Return the environment of a robot, by its name or its YAML's path, and a task, by its name or its file's path.
+
+    cameras: names; image_size: height and width of their pictures [pixels]. settings: fields of `EnvConfig`; the rest
+    is as in `ManipEnv`. Raises what `make_config`, `CameraConfig` and `ManipEnv` raise.
+    """
+    config = make_config(robot, task, **settings)
+    seen = CameraConfig(tuple(cameras), *image_size, look or Look()) if cameras else None
+    return ManipEnv(*parts_of(config), config, cameras=seen, look=look, render_mode=render_mode, conditions=conditions)
+
+
+def parts_of(config: EnvConfig) -> tuple[Robot, Task]:
+    """Return the robot and the task of an environment."""
+    return get_robot(config.robot), get_task(config.task, config.object)
+
+
+# shares: new goals, moved objects, moved objects placed near the hand
+GOALS = 0.8
+OBJECTS = 0.7
+NEAR = 0.5
+_UNTOUCHED = 0.04  # least distance of an untouched object's centre from the hand [m]
+_AROUND = 0.04  # standard deviation of an object's place near the hand, in x and y [m]
+_DEEP = 1e-3  # largest overlap of a moved object with another [m]
+
+
+def redrawn(world: World, visited: State, rng: np.random.Generator) -> State | None:
+    """Return a scene with new goals and new places of untouched objects; None if the drawn places overlap.
+
+    world: restored and changed.
+    """
+    task = world.scene.task
+    world.restore(visited.physics, visited.variation)
+    free, markers = _untouched(world), _markers(world.model)
+    poses = task.draw(rng, world).poses
+    new_goals, moved = rng.uniform() < GOALS, list[int]()
+    for name, (at, turn) in poses.items():
+        body = world.scene.model.body(name).id
+        if name in task.argument_bodies:
+            continue
+        if body in markers:
+            if new_goals:
+                world.place(name, at, turn)
+        elif body in free and rng.uniform() < OBJECTS:
+            near = name in world.scene.objects and rng.uniform() < NEAR
+            world.place(name, _near_hand(world, at, rng) if near else at, turn)
+            moved.append(body)
+    world.update()
+    roots, depths = _contacts(world)
+    overlaps = np.isin(roots, moved).any(axis=1) & (roots[:, 0] != roots[:, 1]) & (depths > _DEEP)
+    return None if overlaps.any() else replace(visited, physics=world.physics())
+
+
+def _untouched(world: World) -> set[int]:
+    """Return bodies of objects and furniture that are at rest and touch only what is fixed to the world."""
+    model, (roots, _) = world.model, _contacts(world)
+    touched = set(roots[(roots > 0).all(axis=1) & (roots[:, 0] != roots[:, 1])].ravel().tolist())
+    ee = world.ee.position.tolist()
+    free = {
+        one.body
+        for name, one in world.scene.objects.items()
+        if world.at_rest(name) and math.dist(world.pose(name).position.tolist(), ee) > _UNTOUCHED
+    }
+    return (free | {body for body in range(model.nbody) if model.body_mocapid[body] >= 0}) - touched
+
+
+@lru_cache(1)
+def _markers(model: mujoco.MjModel) -> set[int]:
+    """Return the bodies that mark goals: mocap bodies without collisions."""
+    solid = set(model.body_rootid[model.geom_bodyid[model.geom_contype > 0]].tolist())
+    return {body for body in range(model.nbody) if model.body_mocapid[body] >= 0 and body not in solid}
+
+
+def _near_hand(world: World, at: F64, rng: np.random.Generator) -> F64:
+    """Return a random place around the hand, at the height of `at`, (3,) [m]."""
+    return np.append(world.ee.position[:2] + rng.normal(0.0, _AROUND, 2), at[2])
+
+
+def _contacts(world: World) -> tuple[NDArray[np.int32], F64]:
+    """Return the root bodies of every contact, (C, 2), and its depth [m], (C,)."""
+    model, contacts = world.model, world.data.contact
+    mujoco.mj_collision(model, world.data)
+    return model.body_rootid[model.geom_bodyid[contacts.geom]], -contacts.dist
+
 
 LIMITS_HZ = 20  # control rate for which tasks give their limits [Hz]; at other rates they last as many seconds
 _TURNED = ("carry", "insert", "insert_tight", "press")  # tasks whose furniture older versions rendered without its yaw

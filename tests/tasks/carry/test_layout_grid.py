@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from manip_il.robots.reach import reach_of
 from manip_il.robots.table import get_robot
-from manip_il.tasks.carry.grid import Grid, descent
+from manip_il.tasks.carry.grid import Grid, cheapest_path, descent, plan
 from manip_il.tasks.carry.layout import FEATURES, TASTES, Edge, Layout, Part, Reward
-from manip_il.tasks.carry.paths import cheapest_path, plan
 
 from ...tables import every_robot
 from .features import path_features

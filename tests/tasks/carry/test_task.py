@@ -14,7 +14,7 @@ from manip_il.tasks.carry.obstacles import EDGE, TASTE_BODIES, is_there, layout_
 from manip_il.tasks.carry.task import OBJECT, descent_of
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
-from manip_il.worlds.ladder.envs import make_env
+from manip_il.worlds.ladder.world import make_env
 
 from ...scenes import SEED, drive_until, started
 from ...tables import every_robot

@@ -1,20 +1,45 @@
-"""Run `manip-il data render`, `redraw`, `relabel`, `build`, `merge`: make a dataset from existing ones."""
+"""Run `manip-il data render`, `redraw`, `relabel`, `build`, `merge`: make a dataset from existing ones.
+
+Run `manip-il data check`, `repair`: find errors in a dataset, and repair them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from manip_il.cli.data_edits import BuildOptions, Edit, MergeOptions, RedrawOptions, RelabelOptions, RenderOptions
+from manip_il.bridges.doctor.examine import examine_folder, repair
+from manip_il.bridges.doctor.files import Finding, warning
+from manip_il.cli.data import (
+    BuildOptions,
+    CheckOptions,
+    Edit,
+    MergeOptions,
+    RedrawOptions,
+    RelabelOptions,
+    RenderOptions,
+    RepairOptions,
+)
 from manip_il.cli.outputs import require_writable
 from manip_il.cli.progress import progress, say, warn
-from manip_il.collect.edits import EditSource, EditTarget, open_source, redraw_dataset, relabel_dataset, render_dataset
-from manip_il.collect.scenes import CHUNK, Scenes
+from manip_il.collect.edits import (
+    CHUNK,
+    EditSource,
+    EditTarget,
+    Scenes,
+    open_source,
+    redraw_dataset,
+    relabel_dataset,
+    render_dataset,
+)
+from manip_il.collect.inputs import differences
 from manip_il.collect.workers import default_workers
-from manip_il.data.atomic import exclusive
+from manip_il.data.atomic import DATASET, exclusive
 from manip_il.data.build import build, merge_datasets
-from manip_il.data.ownership import DATASET
+from manip_il.data.dataset import Dataset
+from manip_il.data.lerobot_layout import OURS
+from manip_il.errors import ManipError
 from manip_il.evaluation.suites import varied
 
 _RUN = "dataset"  # folder of a DAgger run with the states of all rounds
@@ -81,3 +106,42 @@ def run_redraw(options: RedrawOptions) -> None:
         info = redraw_dataset(source, scenes, target)
         left = options.frames - info.episodes
         say(f"redrew {info.episodes:,} scenes, {info.frames:,} frames; {left:,} left out, without a valid label")
+
+
+def run_check(options: CheckOptions) -> None:
+    """Check the dataset and print every finding and the verdict; raises `ManipError` if there are errors."""
+    _conclude(options, _examine(options), f"try manip-il data repair {options.dataset}")
+
+
+def _examine(options: CheckOptions) -> list[Finding]:
+    """Check the dataset and print every finding."""
+    findings = examine_folder(options.dataset.absolute(), [check_robot])
+    say(*map(str, findings))
+    return findings
+
+
+def _conclude(options: CheckOptions, findings: list[Finding], remedy: str) -> None:
+    errors = sum(finding.is_error for finding in findings)
+    if errors:
+        raise ManipError(f"{options.dataset}: errors: {errors}, warnings: {len(findings) - errors}; {remedy}")
+    info = Dataset.open(options.dataset).info
+    say(f"{options.dataset}: {info.episodes:,} episodes, {info.frames:,} frames: whole; warnings: {len(findings)}")
+
+
+def run_repair(options: RepairOptions) -> None:
+    """Check, repair, check again, and print the verdict; raises `ManipError` if errors remain."""
+    if findings := _examine(options):
+        say(*(f"repair   {line}" for line in repair(options.dataset.absolute(), findings)))
+        findings = _examine(options)
+    _conclude(options, findings, "these cannot be repaired from what is here: pull or record it again")
+
+
+def check_robot(dataset: Dataset) -> Iterator[Finding]:
+    """Compare a dataset's joints, observations and model with those of its robot and task in this version."""
+    if dataset.own is None:
+        return
+    try:
+        for text in differences(dataset):
+            yield warning(OURS, text, f"for labels of the current expert: manip-il data relabel {dataset.root}")
+    except ManipError as error:
+        yield Finding(OURS, str(error), "use the version of this program that recorded it, or record again")

@@ -1,7 +1,17 @@
-"""Run `manip-il reward pairs|ask|answer|fit`: rewards from preferences."""
+"""Run `manip-il reward pairs|ask|answer|fit`: rewards from preferences.
+
+Run `manip-il reward irl`: learn a reward from demonstrations.
+
+Run `manip-il data score`: score a dataset's episodes by a reward.
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from manip_il.chapter import inverse
+from manip_il.chapter.inverse import learn
+from manip_il.chapter.preferences import scores as scoring
 from manip_il.chapter.preferences.asking import render_films, render_page
 from manip_il.chapter.preferences.fitting import fit_answers, summary_lines
 from manip_il.chapter.preferences.pairs import (
@@ -14,13 +24,17 @@ from manip_il.chapter.preferences.pairs import (
     join_answers,
     join_pairs,
     read_clips,
+    read_frames,
 )
 from manip_il.chapter.reward import LearnedReward, shape_for, write_reward
+from manip_il.cli.chapter import AnswerOptions, AskOptions, FitOptions, IrlOptions, PairsOptions
+from manip_il.cli.data import ScoreOptions
+from manip_il.cli.outputs import publish
 from manip_il.cli.progress import progress, say
-from manip_il.cli.reward import AnswerOptions, AskOptions, FitOptions, PairsOptions
 from manip_il.data.atomic import write_file, write_json
 from manip_il.data.dataset import Dataset
-from manip_il.learn.policy_folder import find_policy
+from manip_il.errors import ManipError
+from manip_il.learn.checkpoint import find_policy
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.seeding import rng_for, stream_base
 
@@ -72,3 +86,36 @@ def run_fit(options: FitOptions) -> None:
         write_reward(target, found.network, clips.frames[0].spec, stored, fingerprint)
         write_json(folder / "fit.json", found.to_json())
     say(*summary_lines(found, answers), f"reward: {folder}")
+
+
+def run_irl(options: IrlOptions) -> None:
+    """Read, learn, write the reward and the report, print the weights."""
+    with progress(None, f"irl {options.dataset}") as bar:
+        carried = inverse.read_carried(options.dataset, bar.step)
+    rng = rng_for(stream_base("training", options.seed), "irl")
+    learnt = learn(options.method, [one.demonstration for one in carried], rng)
+    found = inverse.Inverse(str(options.dataset), tuple(carried), learnt)
+    with options.open() as folder:
+        page = inverse.inverse_report(found)
+        publish(folder / inverse.FILE_NAME, found.to_json(), [inverse.weight_table(found)], page=page, options=options)
+
+
+PROGRESS = "progress"  # value of --reward: score by true progress
+
+
+def run_score(options: ScoreOptions) -> None:
+    """Score, print the worst episodes, write the files."""
+    data = read_frames(options.dataset)
+    if options.reward != PROGRESS:
+        reward = LearnedReward.load(find_policy(Path(options.reward).expanduser()))
+        reward.check_fits(str(options.dataset), data.spec)
+        found = reward(data.inputs).astype("float64").clip(0.0, 1.0)
+    elif data.progress is not None:
+        found = data.progress
+    else:
+        raise ManipError(f"{options.dataset} has no progress column; give --reward=FOLDER")
+    scores = scoring.Scores(str(options.dataset), options.reward, data, found)
+    with options.open(Path(options.reward).expanduser()) as folder:
+        scoring.write_weights(folder / scoring.WEIGHTS_FILE, scores)
+        worst = [scoring.worst_table(scores)]
+        publish(folder / scoring.FILE_NAME, scores.to_json(), worst, *scoring.fact_lines(scores))

@@ -8,7 +8,7 @@ from dataclasses import replace
 from manip_il import checks
 from manip_il.cli.outputs import OutputFile, about, publish
 from manip_il.cli.progress import progress, say
-from manip_il.cli.robot import CertifyOptions, RobotCheckOptions, RobotNewOptions
+from manip_il.cli.robots import CertifyOptions, RobotCheckOptions, RobotNewOptions
 from manip_il.collect.inputs import env_config
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_file, write_json

@@ -1,4 +1,7 @@
-"""`manip-il data render`, `redraw`, `relabel`, `build`, `merge`: make a dataset from existing ones."""
+"""`manip-il data render`, `redraw`, `relabel`, `build`, `merge`: make a dataset from existing ones.
+
+`manip-il data check`, `repair`: find errors in a dataset, and repair them.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,9 @@ from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 
 from manip_il.checks import parse_yaml, shorten
-from manip_il.cli.common_options import SMALL, Pictured, Varied
-from manip_il.cli.options import Given, given
-from manip_il.cli.outputs import Replacing
+from manip_il.cli.common_options import SMALL, OfDataset, Pictured, Varied
+from manip_il.cli.outputs import Output, Replacing, output_folder
+from manip_il.cli.parsing import Given, given
 from manip_il.errors import UsageError
 from manip_il.option import NameOrPath, Seeded, option
 from manip_il.sim.config import CameraConfig, Look
@@ -122,3 +125,38 @@ class RedrawOptions(Edit, Varied, Seeded):
         1, "control steps that the expert drives from every scene; more than 1 for act and diffusion", at_least=1
     )
     image: Given = given(CameraConfig, **SMALL)
+
+
+@dataclass(frozen=True)
+class CheckOptions(OfDataset):
+    """Check any LeRobot v3.0 dataset: files, rows, video frames, statistics, and whether a policy can learn from it.
+
+    Prints one line per finding, with what to do. The exit code is 1 if there are errors, 0 if only warnings.
+
+    Example: manip-il data check datasets/demos
+    """
+
+
+@dataclass(frozen=True)
+class RepairOptions(CheckOptions):
+    """Rebuild a dataset from its journals; without them recompute counts and statistics, and move leftover files away.
+
+    Replaced files are kept in DATASET.before-repair. Then the dataset is checked again.
+
+    Example: manip-il data repair datasets/demos
+    """
+
+
+@dataclass(frozen=True)
+class ScoreOptions(OfDataset, Output):
+    """Score every frame and episode of a dataset by a reward, and list the worst episodes.
+
+    Writes scores.json, and rabc.parquet with the frames' weights for manip-il train --weights= and
+    lerobot-train --sample_weighting.progress_path=. If the dataset says which episodes failed, also prints how well the
+    score detects them.
+
+    Example: manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores
+    """
+
+    reward: str = option(MISSING, "a folder from manip-il reward fit, or progress for the true progress")
+    output_dir: Path = output_folder("runs/scores")
