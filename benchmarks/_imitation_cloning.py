@@ -5,8 +5,6 @@ line of JSON. Demonstrations are from a scripted expert of four rules, collected
 at the last step, on 200 unseen seeds.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

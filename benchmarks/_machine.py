@@ -1,7 +1,5 @@
 """The machine that a measurement ran on, printed above every table."""
 
-from __future__ import annotations
-
 import os
 import platform
 from importlib.metadata import version

@@ -7,8 +7,6 @@ replaying the same controls from the same starts. Both alternate episode by epis
 median ratio over the repeats.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -7,8 +7,6 @@ at most 15 %: the time that one core needs to label every state of the round aga
 relative to the round's wall-clock in the same run.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -9,8 +9,6 @@ own), against the whole command `manip-il eval`; both may use every core. Outcom
 diffusion policy (`configs/diffusion_state.yaml`, a tenth of its steps), which draws from its own seeds.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -4,8 +4,6 @@ Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET, with a dataset from `
 seed.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

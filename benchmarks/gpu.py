@@ -10,8 +10,6 @@ per action for 25 episodes in lockstep, on GPU and CPU, and pictures/s of the re
 At most 8 minutes. Without a GPU it prints a message and exits with 0.
 """
 
-from __future__ import annotations
-
 import os
 import statistics
 import subprocess

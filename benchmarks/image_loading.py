@@ -10,8 +10,6 @@ to decode all frames once, in epochs of LeRobot's loader. All alternate in the s
 of the repeats.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import subprocess

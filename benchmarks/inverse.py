@@ -10,8 +10,6 @@ Limits: 3 % above for maximum entropy and Bayesian, 10 % for maximum margin; 60 
 entropy, 300 s for Bayesian.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

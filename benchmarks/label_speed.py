@@ -6,8 +6,6 @@ The states are from episodes driven by the expert and by random actions. The lim
 beforehand; both alternate in the same run, state by state, and the tasks alternate, too.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -8,8 +8,6 @@ the same run, in CPU seconds; the result is the median ratio. Also prints the sh
 and of the discriminator.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -8,8 +8,6 @@ shadows and with one sample per pixel. All render the same states at the same si
 at a time; the result is the median ratio over the repeats.
 """
 
-from __future__ import annotations
-
 import argparse
 import copy
 import statistics

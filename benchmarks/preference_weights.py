@@ -13,8 +13,6 @@ on the same unseen seeds.
 Limits: mean agreement at least 90 %, area at least 0.95, weighted ahead by at least 15 points with p < 0.001.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

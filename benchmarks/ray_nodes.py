@@ -7,8 +7,6 @@ All record journals of the same episodes, alternating, with warm workers; median
 an episode that a worker sends back.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import statistics

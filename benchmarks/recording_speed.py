@@ -9,8 +9,6 @@ Two workers: the same recording with two processes against one, all warm, and ba
 one, which is the machine's limit. The result is the median ratio over the repeats.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import statistics

@@ -11,8 +11,6 @@ ratio: of the commands' times; our pull ends when all data are on disk, the plai
 on disk: of the times until all data are on this machine's disk.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import getpass

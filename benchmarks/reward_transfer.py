@@ -11,8 +11,6 @@ driver with the true weights on the same layouts, and on the Panda how often it 
 Limits: at most 5 % above on every arm; cheaper than the clone with p < 0.01.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import sys

@@ -10,8 +10,6 @@ wall time until a new episode is on disk. At the largest size: the wall time of 
 same one in an empty folder, alternating.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -3,8 +3,6 @@
 Usage: MUJOCO_GL=egl python benchmarks/task_strips.py [TASK ...]; writes docs/tasks/TASK.jpg.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -10,8 +10,6 @@ environment with that library, which needs other versions than this project:
 python3.11 -m venv peer && peer/bin/pip install imitation==1.0.1 gymnasium-robotics==1.2.4
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

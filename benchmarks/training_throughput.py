@@ -6,8 +6,6 @@ DATASET is the root of a local LeRobot dataset with our columns; without it a sm
 LeRobot's own API. Prints samples/s of loading and of a whole optimisation step, and the ratios.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 import time

@@ -3,8 +3,6 @@
 Usage: MUJOCO_GL=egl python benchmarks/two_arms.py; writes docs/two_arms.gif, in about two minutes.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

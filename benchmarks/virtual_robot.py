@@ -3,8 +3,6 @@
 Usage: MUJOCO_GL=egl python benchmarks/virtual_robot.py; writes docs/virtual_robot.png, in about a minute.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -9,8 +9,6 @@ median ratio over the repeats. The peer's time per episode grows with its video 
 larger for longer datasets.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os

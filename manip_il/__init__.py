@@ -5,8 +5,6 @@ gymnasium no longer loads plugins from the entry point `gymnasium.envs`.) It als
 mujoco reads MUJOCO_GL only when it is imported.
 """
 
-from __future__ import annotations
-
 import ctypes.util
 import os
 from importlib import import_module

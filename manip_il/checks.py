@@ -4,8 +4,6 @@ Every check returns the value with its declared type, or raises `ManipError` wit
 shortened value and what was expected. `in_child` opens untrusted files in a limited child process.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -3,8 +3,6 @@
 The command line prints a `ManipError` as one line on standard error and exits with its `exit_code`.
 """
 
-from __future__ import annotations
-
 import difflib
 import logging
 import reprlib

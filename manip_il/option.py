@@ -1,7 +1,5 @@
 """Options for users: dataclass fields with a line of help, which the command line shows."""
 
-from __future__ import annotations
-
 import math
 import numbers
 import sys

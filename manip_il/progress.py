@@ -1,7 +1,5 @@
 """What a long piece of work reports while it runs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 

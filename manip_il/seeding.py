@@ -5,8 +5,6 @@ user's `--seed` shifts all streams to other blocks, so that demonstrations, ever
 and the final test never share a seed, and no stream holds 1000, LeRobot's default seed.
 """
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ways to damage a dataset, and what the doctor says then."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

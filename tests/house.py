@@ -6,8 +6,6 @@ The docstring of a public function that takes or gives arrays says a shape, `(B,
 each other in no circle, imports for type checkers included. Exits with 1 if something is found.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

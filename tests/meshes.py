@@ -1,7 +1,5 @@
 """Ten objects as meshes, made of numbers: each function returns a closed `Trimesh` in metres, z up."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

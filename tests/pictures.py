@@ -1,7 +1,5 @@
 """Episodes whose pictures hold their number, as twelve squares, light for a one; and the frames of video files."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections import Counter

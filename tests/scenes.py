@@ -1,7 +1,5 @@
 """Environments at a start, and the expert that drives them on."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

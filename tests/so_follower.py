@@ -3,8 +3,6 @@
 Units, names and features are all LeRobot's; ours are compared with them.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Synthetic episodes: right columns, random numbers, no simulator."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

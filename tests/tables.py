@@ -4,8 +4,6 @@ Scenes are every robot with the tasks of one cube, and every other task with the
 fact shows in the former.
 """
 
-from __future__ import annotations
-
 import pytest
 
 from manip_il.robots import ROBOTS

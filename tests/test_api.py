@@ -1,7 +1,5 @@
 """The package's public names: what notebooks and scripts use in place of the commands."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files from outside have one door: only `checks.py` opens them, others read what it opened, or are listed here."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

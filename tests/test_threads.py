@@ -1,7 +1,5 @@
 """Calls in several threads of one process give what the same calls give one after another."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Worlds that vary: every draw is in the state and in the episode, labels and steps of a restored state are its own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Commands in forks of a process that has imported LeRobot, so that not every one of them takes seconds to start."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -4,8 +4,6 @@ Nothing of this project is imported unless named on the command line: LeRobot mu
 line comes in, `{"words", "folder", "out", "err"}`, the words those of a shell; the exit code goes out.
 """
 
-from __future__ import annotations
-
 import atexit
 import gc
 import importlib

@@ -1,7 +1,5 @@
 """Run DAgger, or another algorithm of imitation, in a folder."""
 
-from __future__ import annotations
-
 import json
 import logging
 from dataclasses import asdict, fields, replace

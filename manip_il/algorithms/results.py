@@ -1,7 +1,5 @@
 """Results of a run: timing, one result per round or iteration, the best one, and the report."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager

@@ -7,8 +7,6 @@ round_003/policy/      the fit; the other members of an ensemble are policy_1, .
 round_003/eval.json    the validation
 """
 
-from __future__ import annotations
-
 import logging
 import shutil
 from collections.abc import Callable, Iterator, Sequence

@@ -10,8 +10,6 @@ by running its loop again.
     best/                the policy with the highest validation success; on a tie the latest
 """
 
-from __future__ import annotations
-
 import importlib
 import itertools
 import shutil

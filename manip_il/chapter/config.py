@@ -1,7 +1,5 @@
 """Options of GAIL, AIRL and PPO; importing them needs neither torch nor stable-baselines3."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The chapter's other methods in Python, as the course uses them: theory, inverse RL, GAIL, preferences."""
 
-from __future__ import annotations
-
 from manip_il.chapter.config import LearningConfig
 from manip_il.chapter.inverse import Inverse, Learnt, learn, read_carried
 from manip_il.chapter.learning import LearningRun

@@ -13,8 +13,6 @@ step before the absorbing state but none in it, as no action is sampled there, a
 of H.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

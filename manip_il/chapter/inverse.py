@@ -4,8 +4,6 @@ Layouts, goals and object positions are read from `observation.environment_state
 The results are the weights of a reward, `reward.json`, and the report of `manip-il reward irl`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -6,8 +6,6 @@ begin and end together, so that only the weights and the optimiser's state persi
 iterations; they are saved as safetensors and JSON.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

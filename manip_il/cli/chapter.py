@@ -5,8 +5,6 @@
 `manip-il rl gail`, `airl`, `ppo`: reinforcement learning from demonstrations or a learnt reward.
 """
 
-from __future__ import annotations
-
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import ClassVar, Literal

@@ -5,8 +5,6 @@
 A study runs `manip-il dagger` with several sets of options (its arms), each with the same training seeds.
 """
 
-from __future__ import annotations
-
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal

@@ -7,8 +7,6 @@
 `manip-il demo`: demonstrations, cloning, DAgger, and a report that compares them.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from pathlib import Path

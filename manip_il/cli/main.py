@@ -3,8 +3,6 @@
 Nothing heavy is imported before a command's options are read, so that help and errors appear at once.
 """
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import logging

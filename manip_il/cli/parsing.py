@@ -11,8 +11,6 @@ dict of a group whose options only another program knows (`--policy.*`). `given(
 `Config` that the user gave; the command makes a `Config` from them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json

@@ -5,8 +5,6 @@
 `manip-il robot new`, `check`, `certify`: a YAML file for your own arm, and what the arm and its expert can do.
 """
 
-from __future__ import annotations
-
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import ClassVar, Literal

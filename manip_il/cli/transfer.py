@@ -1,7 +1,5 @@
 """`manip-il push`, `pull`: move datasets and policies."""
 
-from __future__ import annotations
-
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 

@@ -8,8 +8,6 @@ New scenes from visited states: randomise goals, untouched objects and appearanc
 The expert is a function of the state, so it can label scenes that were never visited.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace

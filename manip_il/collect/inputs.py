@@ -1,7 +1,5 @@
 """What work does with its inputs: the environment that is meant, and whether datasets and policies fit it."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from typing import Any

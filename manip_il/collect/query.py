@@ -6,8 +6,6 @@ divided by each dimension's longest step, and the largest quotient is compared w
 same for every robot.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal

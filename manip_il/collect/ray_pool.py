@@ -4,8 +4,6 @@ Workers return episodes to this process, which stores them. Nodes need no shared
 own task and mesh are sent to them, once per node.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import pickle

@@ -3,8 +3,6 @@
 Record a dataset: the expert's demonstrations, or a policy's rollouts with the expert's labels.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence

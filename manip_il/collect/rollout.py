@@ -4,8 +4,6 @@ Environments run in lockstep, so that a learner acts in all of them in one batch
 consume its transitions and are not branches inside it. In this loop only `_choose` queries the expert.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field

@@ -7,8 +7,6 @@ Whether this program made a folder, and of which kind it is: known by what it wr
 Everything that replaces, empties or adds to a folder asks here first.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import errno

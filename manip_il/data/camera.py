@@ -5,8 +5,6 @@ content: a playlist named `.mp4` would make it open other files and URLs. Pillow
 (EPS to Ghostscript).
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import os

@@ -4,8 +4,6 @@ One rollout is one `Episode`: the learner's path, followed by the expert's takeo
 ends with `next.done`; in a dataset each is an episode (`parts`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Differences between fingerprints of environments, and the hash of a policy."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path

@@ -5,8 +5,6 @@ Numbers and pictures keep every bit. Pictures are stored raw and compressed by t
 similarity of successive frames: rendered frames of 128 x 128 took a third of a PNG's bytes and a fifth of its time.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction

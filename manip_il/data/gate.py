@@ -5,8 +5,6 @@ for a picture has no bytes, they open its `path`, even a URL. Only what LeRobot 
 in data files, in the columns that `info.json` calls images, and plain values and lists everywhere else.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Collection, Mapping

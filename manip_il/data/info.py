@@ -1,7 +1,5 @@
 """Read `meta/info.json` of any LeRobot dataset."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator
 from contextlib import contextmanager

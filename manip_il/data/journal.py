@@ -4,8 +4,6 @@ A file is written under a temporary name, synced and renamed, so it is complete 
 bit: numbers as an attachment (`<column>.npy`), pictures as messages. Foxglove shows all messages.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass

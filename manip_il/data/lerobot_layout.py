@@ -3,8 +3,6 @@
 Copied here (and tests compare the two), because importing `lerobot.datasets` imports torch, which takes seconds.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ LeRobot's own writer takes 80 to 160 ms per episode and loses all of them when i
 files in a few milliseconds per episode, and the dataset appears complete or not at all. Tests read it with LeRobot.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import shutil

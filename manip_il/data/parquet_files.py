@@ -4,8 +4,6 @@ The random draws of an episode are a column of ours in `meta/episodes`, one JSON
 keeps the column, its split and delete drop it; the draws are also part of `sim_state`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The columns of a dataset: keys, dtypes and shapes (LeRobot v3.0)."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from fractions import Fraction

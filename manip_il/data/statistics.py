@@ -5,8 +5,6 @@ Statistics of an episode are exact: a quantile is the value of rank ceil(q T), w
 quantile is the mean of the episodes' quantiles, weighted by their frames.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

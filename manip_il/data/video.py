@@ -4,8 +4,6 @@ LeRobot writes one file per episode and then copies all earlier episodes into a 
 (and tests compare the two), because importing `lerobot.configs.video` imports torch, which takes seconds.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import shutil

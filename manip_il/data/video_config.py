@@ -1,7 +1,5 @@
 """Settings of the video encoder, separate from the encoder, which is slow to import."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from manip_il.errors import UnknownName

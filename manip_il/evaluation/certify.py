@@ -11,8 +11,6 @@ be undone, not quadratic. Rajaraman et al. (2021) call this mu-recoverability. T
 here, is a lower bound of u.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple

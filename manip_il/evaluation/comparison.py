@@ -1,7 +1,5 @@
 """Comparison of sides on the same test episodes: which one is better, and what each cost."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field

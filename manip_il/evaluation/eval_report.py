@@ -1,7 +1,5 @@
 """`report.html` of an evaluation, a run's policies or a comparison: success, failures, costs and films."""
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 A panel is as wide as a phone's screen, so that its text stays readable there; wide windows show panels side by side.
 """
 
-from __future__ import annotations
-
 import io
 import textwrap
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Films of episodes, rendered from their recorded states."""
 
-from __future__ import annotations
-
 import io
 import logging
 from collections.abc import Iterable, Sequence

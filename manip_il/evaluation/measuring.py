@@ -1,7 +1,5 @@
 """Evaluate a policy, and run an episode of an evaluation again."""
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Mapping, Sequence

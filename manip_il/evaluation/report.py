@@ -1,7 +1,5 @@
 """`report.html`: one file without network access or scripts, rendered from the template beside this module."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from dataclasses import dataclass, field

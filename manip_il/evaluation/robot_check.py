@@ -1,7 +1,5 @@
 """Checks of a custom arm before anything is recorded: gripper, reach, start states, and the expert on every task."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Evaluate policies on given seeds: finished episodes are saved at once, and any episode can be rerun alone."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Suites of conditions for evaluations, and the parts of a condition that affect a task."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

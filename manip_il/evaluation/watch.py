@@ -1,7 +1,5 @@
 """Show running episodes in a window, whose sliders may drive the robot, or in Rerun, live or through a file."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Sequence
 from pathlib import Path

@@ -6,8 +6,6 @@ LeRobot calls each once per step, as lerobot-eval does. These two are subclasses
 whole plan relative to the joints at its start, so LeRobot connects the two when it loads them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, cast
 

@@ -3,8 +3,6 @@
 While training, pictures can be cropped and recoloured at random.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

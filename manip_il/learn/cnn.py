@@ -3,8 +3,6 @@
 Options, policy and processors are in one module that LeRobot can treat as a package: see `manip_il.learn.mlp`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

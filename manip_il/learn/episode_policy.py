@@ -10,8 +10,6 @@ So every call has `ROWS` rows, and an episode's number determines its row. Plans
 which are computed with a single row.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 from collections import defaultdict

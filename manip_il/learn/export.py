@@ -4,8 +4,6 @@ Its inputs are raw observations under LeRobot's names, its outputs absolute acti
 and clipping too, is in the file. Its metadata say what the names, shapes and units mean.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,7 +1,5 @@
 """LeRobot's configurations (policy, optimiser, schedule, ...), built from the user's options."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import json

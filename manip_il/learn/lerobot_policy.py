@@ -1,7 +1,5 @@
 """LeRobot's policies and processors, built for a fit or loaded from a checkpoint."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import warnings

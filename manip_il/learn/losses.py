@@ -8,8 +8,6 @@ pi(. | s). The network gives `params` (B, size) for B rows; targets (B, n) are i
 Acting is deterministic: one action per state. `mse` and `l1` do not model the spread.
 """
 
-from __future__ import annotations
-
 import math
 from typing import override
 

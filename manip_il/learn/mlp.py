@@ -4,8 +4,6 @@ LeRobot expects all three in the module of the options class. A LeRobot plugin m
 `--policy.discover_packages_path=manip_il.learn.mlp`: hence `__path__`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ A sample may include frames around its own, its window, which LeRobot's policies
 outside the episode are replaced by the nearest one inside, and `<column>_is_pad` marks them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

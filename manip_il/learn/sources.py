@@ -4,8 +4,6 @@ Normalisation statistics cover the frames of all datasets, each counted once, wh
 change without changing the units in which a policy observes and acts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

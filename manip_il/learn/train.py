@@ -5,8 +5,6 @@ The data are in memory, so that a batch is one gather per column; a batch depend
 Train a policy on datasets: behaviour cloning.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import math

@@ -1,7 +1,5 @@
 """The options of `--env.type=manip_il`, in LeRobot's form."""
 
-from __future__ import annotations
-
 import multiprocessing
 import sys
 from dataclasses import dataclass, field

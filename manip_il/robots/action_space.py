@@ -1,7 +1,5 @@
 """Meaning of a robot's action, number by number."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Typed values read from a robot's YAML, and a MuJoCo model's files, patched as the YAML says."""
 
-from __future__ import annotations
-
 import importlib.util
 import multiprocessing
 import sys

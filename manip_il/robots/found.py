@@ -1,7 +1,5 @@
 """Find in a robot's model what its YAML may omit: gains and limits of motors, the hand's frame, the home posture."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

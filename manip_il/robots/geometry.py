@@ -3,8 +3,6 @@
 Rotations of a hand: matrices from and to rotation vectors and yaws, and angles between them.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ A sweep relates command and opening: when a robot is first used, its gripper is 
 the gap between the fingers is measured once they rest. Parallel, hinged and linked fingers are thus treated alike.
 """
 
-from __future__ import annotations
-
 import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Differential inverse kinematics of one arm, with mink."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

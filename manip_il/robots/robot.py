@@ -1,7 +1,5 @@
 """A robot, an arm with a gripper, as dataclasses: one per section of its YAML, which names parts of its MJCF."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """A robot's model as an `MjSpec`: with position control and the site `ee`, without what belongs to a scene."""
 
-from __future__ import annotations
-
 import fnmatch
 import itertools
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """A first draft of the YAML for a robot's MJCF: the hand's body, the joints that drive the fingers, and a workspace."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections.abc import Mapping, Sequence

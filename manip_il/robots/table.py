@@ -1,7 +1,5 @@
 """Robots by name, from their YAML; what the YAML omits is found in the model."""
 
-from __future__ import annotations
-
 import typing
 from collections.abc import Mapping
 from dataclasses import replace

@@ -4,8 +4,6 @@ A packet is `FF FF id length instruction parameters checksum`; an answer has an 
 The checksum is the complement of the sum of all bytes from the id on. Present_Position = encoder - Homing_Offset.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

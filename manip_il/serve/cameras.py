@@ -1,7 +1,5 @@
 """Cameras over ZMQ, in the format of LeRobot's own image server: JSON with JPEG in base64."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time

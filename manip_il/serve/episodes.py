@@ -3,8 +3,6 @@
 A frame is logged when the client reads the follower's position, so that the frames match those of its own dataset.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

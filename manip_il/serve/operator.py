@@ -1,7 +1,5 @@
 """Run a LeRobot program on a station, and do what a person would: press its keys and move the arms."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty

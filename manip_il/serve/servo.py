@@ -1,7 +1,5 @@
 """How an STS3215 moves a joint: a position loop with gain, torque and speed limits, gear play and delay."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 

@@ -1,7 +1,5 @@
 """A session of the virtual arm: open the ports, cameras, leader and program of `manip-il serve`, and close them."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import gc

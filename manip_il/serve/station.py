@@ -1,7 +1,5 @@
 """A simulated arm, its world and its leader, which advance with the wall clock, whether or not a client reads them."""
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Settings of episodes and their pictures; importing this module loads no simulator."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from manip_il.errors import UnknownName, UsageError

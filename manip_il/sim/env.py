@@ -1,7 +1,5 @@
 """One gymnasium environment for every robot and task, with exact save and restore, and with conditions."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace

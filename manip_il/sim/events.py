@@ -3,8 +3,6 @@
 Functions that change the world do so in place, and draw from the generator that they are given.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """An object's mesh, read from an STL or OBJ file."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Named keypoints of a scene: the positions that its task observes, and the upper corners of its boxes."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from itertools import product
 

@@ -1,7 +1,5 @@
 """Visual objects without contact: the stand of a goal, and clutter around the workspace."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

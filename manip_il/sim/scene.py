@@ -1,7 +1,5 @@
 """Build one compiled scene of robot and task: the robot is attached to the world's spec."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from itertools import product

@@ -4,8 +4,6 @@ First five numbers per object: MuJoCo's `geom_size` (3,) [m], the mass [kg] and 
 of the world as a whole, such as `table` and `clutter`, with the names and units of `Condition`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

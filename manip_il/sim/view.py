@@ -5,8 +5,6 @@ One episode's drawn values are applied to it and undone for the next.
 Software rendering costs time per triangle, and the Panda's meshes have 136,040 for an arm that is 60 pixels tall.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from functools import lru_cache

@@ -4,8 +4,6 @@ It shows a copy of the model and of the physics: changes in its panels do not af
 can use the control sliders (`commands`) and the pull of the mouse (`pull`).
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import os

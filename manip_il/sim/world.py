@@ -3,8 +3,6 @@
 Lengths in [m], angles in [rad], all in the world's frame: z = 0 is the table's top, x points away from the robot.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable, Mapping

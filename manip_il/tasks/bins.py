@@ -1,7 +1,5 @@
 """Open boxes, and the ladder that drops objects into them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

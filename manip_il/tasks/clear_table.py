@@ -1,7 +1,5 @@
 """Clear the table: put four cubes into a box."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import product

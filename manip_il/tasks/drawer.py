@@ -1,7 +1,5 @@
 """Drawer: open it by its handle, put the object in, close it."""
 
-from __future__ import annotations
-
 import math
 
 import mujoco

@@ -1,7 +1,5 @@
 """How a downward hand can grasp an object as it lies, from the symmetry of its shape."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from functools import wraps

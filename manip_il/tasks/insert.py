@@ -1,7 +1,5 @@
 """Insert: put a square peg, which stands or lies anywhere on the table, into a hole."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

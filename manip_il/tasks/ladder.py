@@ -5,8 +5,6 @@ hand is to being over the object, the lower it may go. Neighbouring states then 
 learner can fit. The fingers' contacts show whether an object is held; nothing is stored.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Free objects, furniture and goal markers that tasks put on the table."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A peg: grip it, set it upright, release and catch it, and move it; the ladder and progress of tasks with a peg."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import lru_cache

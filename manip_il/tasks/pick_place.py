@@ -1,7 +1,5 @@
 """Pick and place: move an object to a goal on the table or in the air. Lift: to a goal above its start."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Self

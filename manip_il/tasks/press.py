@@ -1,7 +1,5 @@
 """Press: push a button, which stands anywhere on the table, to its stop."""
 
-from __future__ import annotations
-
 import math
 
 import mujoco

@@ -1,7 +1,5 @@
 """Push: move a puck to a goal on the table without grasping it."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

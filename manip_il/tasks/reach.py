@@ -1,7 +1,5 @@
 """Reach: move the hand to a goal in the air."""
 
-from __future__ import annotations
-
 import math
 
 import mujoco

@@ -1,7 +1,5 @@
 """Sort: of three cubes, put the one that the instruction names into the bin of its colour."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

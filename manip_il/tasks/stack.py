@@ -1,7 +1,5 @@
 """Stack: put one cube on another, where it stands by itself."""
 
-from __future__ import annotations
-
 import math
 
 import mujoco

@@ -1,7 +1,5 @@
 """Random starts within an arm's reach."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 
 import mujoco

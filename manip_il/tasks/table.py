@@ -4,8 +4,6 @@ A file runs only if the user gives its `Path`, never because a dataset, a checkp
 these store is a `str`, which is a name.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import inspect

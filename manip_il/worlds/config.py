@@ -1,7 +1,5 @@
 """Names of worlds, and the settings of an environment by the names of robot and task."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple

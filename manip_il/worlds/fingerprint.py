@@ -1,7 +1,5 @@
 """Versions and hashes that determine the bytes that an environment computes."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

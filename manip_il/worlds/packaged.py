@@ -1,7 +1,5 @@
 """What environments of other packages share: they run unmodified, and MuJoCo's state restores them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from typing import Any, ClassVar, NamedTuple, cast, override

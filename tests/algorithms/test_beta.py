@@ -1,7 +1,5 @@
 """beta_i of Ross, Gordon & Bagnell (2011), section 3.6."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest

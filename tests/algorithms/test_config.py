@@ -1,7 +1,5 @@
 """What does not go together is refused in one line, before anything runs."""
 
-from __future__ import annotations
-
 import pytest
 
 from manip_il.algorithms.config import RunConfig, plan_of

@@ -1,7 +1,5 @@
 """DART's noise is the learner's own error, dimension by dimension and together."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

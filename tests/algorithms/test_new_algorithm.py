@@ -1,7 +1,5 @@
 """An algorithm is one file: here two that are in no table, on a run that resumes by itself."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

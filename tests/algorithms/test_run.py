@@ -1,7 +1,5 @@
 """Runs on a very small scale: what it leaves on disk, and that a stopped run goes on as if it had not been."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

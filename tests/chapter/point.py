@@ -1,7 +1,5 @@
 """A point that is to come to a place: an environment of one number, and what a learner on it is made of."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,5 @@
 """Discriminators: they learn who acted, their rewards prefer the expert, and the penalty bounds them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Environments in lockstep: what reaches the robot, when an episode ends, and that it depends on its seed alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

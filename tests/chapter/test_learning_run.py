@@ -1,7 +1,5 @@
 """Runs of GAIL, AIRL and of a given reward, very small: what lies on disk, and that a stopped run goes on bit-equal."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path

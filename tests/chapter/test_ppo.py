@@ -1,7 +1,5 @@
 """PPO over the mlp's network: the density is the network's, the absorbing state teaches nothing, runs go on."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,5 @@
 """Demonstrations as episodes of one length: what is padded, what is left out, what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

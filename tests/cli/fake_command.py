@@ -1,7 +1,5 @@
 """A small command that does what it is told, for the tests of the command line."""
 
-from __future__ import annotations
-
 import os
 import signal
 from dataclasses import dataclass, field

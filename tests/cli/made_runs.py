@@ -1,7 +1,5 @@
 """Runs of `manip-il dagger` as they lie on disk, made without running anything."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

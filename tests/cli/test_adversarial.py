@@ -1,7 +1,5 @@
 """`manip-il rl gail` ends with a policy, metrics and a page, and is continued."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

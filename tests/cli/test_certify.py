@@ -1,7 +1,5 @@
 """`manip-il robot certify` writes what it measured and prints it; what cannot be is one line before the first step."""
 
-from __future__ import annotations
-
 import json
 
 from manip_il.cli.main import main

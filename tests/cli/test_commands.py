@@ -1,7 +1,5 @@
 """Recording, training, DAgger and the demo from the command line."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

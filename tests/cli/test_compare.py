@@ -1,7 +1,5 @@
 """Two sides of any kind meet on the same episodes; what is measured is not measured again; bad input is one line."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

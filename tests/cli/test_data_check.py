@@ -1,7 +1,5 @@
 """`manip-il data check`: one line a finding, a verdict, an exit code."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Suites, stopping by width, parts and their merge, resuming, and replaying one line of eval.json."""
 
-from __future__ import annotations
-
 import base64
 import json
 from pathlib import Path

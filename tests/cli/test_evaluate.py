@@ -1,7 +1,5 @@
 """Any LeRobot checkpoint is measured by one command, and a bad one is refused in one line before the first step."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from pathlib import Path
 

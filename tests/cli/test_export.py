@@ -1,7 +1,5 @@
 """`manip-il export`: one file, refused early where it cannot be, and run without this package as the docs show."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`manip-il data to-mcap` and `manip-il data from-mcap`, as typed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mistakes are one line and exit code 2; like help, they are answered before anything heavy is imported."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Options from words and YAML; a mistake is one short line."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """Output folders: what a kill leaves, what may be overwritten, and one command at a time."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

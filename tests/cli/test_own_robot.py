@@ -1,7 +1,5 @@
 """The commands take a robot by the path of its YAML, in a folder."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`manip-il rl ppo`: a clone goes on from a reward learnt from preferences, of the same robot and task."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 from manip_il.cli.progress import progress, say, set_quiet, warn

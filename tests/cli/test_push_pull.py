@@ -1,7 +1,5 @@
 """`manip-il push` and `manip-il pull`: what they say, and their exit codes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Datasets: built again from journals to the bytes that were recorded, and rendered again with other pictures."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import asdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`manip-il data redraw`: a dataset to train from, the same on two workers, and read by LeRobot."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

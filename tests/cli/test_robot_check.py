@@ -1,7 +1,5 @@
 """`manip-il robot check`: one page of what an arm can do."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """However an address is written, no part of its password is printed: not in errors, not in tracebacks."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from urllib.parse import quote

@@ -1,7 +1,5 @@
 """What a dataset, a policy or an evaluation names is never a path: nothing outside its folder is opened or run."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """A study runs what is not there, compares all of it, and says in one line what is wrong with its file."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`--trust` is said on the command line alone, to every command that loads a policy; and what `--policy.path` means."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

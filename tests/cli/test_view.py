@@ -1,7 +1,5 @@
 """Episodes are watched as they happen: in a file of Rerun's every step is what was simulated."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Policies that are fitted a little to a few of the expert's episodes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from manip_il.collect.job import RolloutJob

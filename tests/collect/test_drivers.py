@@ -1,7 +1,5 @@
 """Who drives, and when the expert is queried: each driver and each rule."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Datasets made of stored states: labels are the expert's, pictures those of recording, scenes sound."""
 
-from __future__ import annotations
-
 import math
 from contextlib import closing
 from dataclasses import replace

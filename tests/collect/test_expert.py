@@ -1,7 +1,5 @@
 """The expert is a function of the state: continuous within a rung, never a jump, silent where it knows nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache, lru_cache
 

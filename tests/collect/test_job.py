@@ -1,7 +1,5 @@
 """A job and a seed are an episode, wherever and beside whomever it runs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

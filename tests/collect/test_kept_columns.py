@@ -1,7 +1,5 @@
 """A dataset that somebody has added columns and texts to keeps them through everything that rewrites it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Episodes on disk: what is there is not run again, and what comes out depends on the seeds alone."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path

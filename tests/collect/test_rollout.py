@@ -1,7 +1,5 @@
 """The one loop, on an environment that is a number."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

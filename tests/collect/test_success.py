@@ -3,8 +3,6 @@
 From the start, in every scene: `tests/tasks/test_every_task.py`.
 """
 
-from __future__ import annotations
-
 import pytest
 
 from manip_il.collect.job import RolloutJob

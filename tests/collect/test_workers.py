@@ -1,7 +1,5 @@
 """Where episodes run does not matter, and a worker that dies costs no episode: in processes, and on a Ray cluster."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import logging

@@ -1,7 +1,5 @@
 """The course's notebooks run from a fresh kernel, and every check in them fails until the reader has done its part."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from copy import deepcopy

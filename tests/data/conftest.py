@@ -1,7 +1,5 @@
 """Synthetic episodes, some of them with pictures, and no network."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """Files and folders are whole or absent, a folder has one writer, and what a disk refuses names the path."""
 
-from __future__ import annotations
-
 import errno
 import os
 import resource

@@ -1,7 +1,5 @@
 """Pictures that are decoded, at once or when they are read, are LeRobot's. It imports torch: some seconds."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

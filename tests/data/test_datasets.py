@@ -1,7 +1,5 @@
 """Writing, reading and merging datasets with pyarrow alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -1,7 +1,5 @@
 """What parquet files, statistics and videos would have other readers open or decode is refused in one line."""
 
-from __future__ import annotations
-
 import json
 import tracemalloc
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Names from journals and datasets never lead out of the folder that they stand in."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

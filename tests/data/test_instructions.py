@@ -1,7 +1,5 @@
 """Episodes that each have a text of their own: what a dataset makes of them, and everything that reads it."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

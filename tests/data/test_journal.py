@@ -1,7 +1,5 @@
 """One file an episode: whole and bit for bit, or refused by name."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

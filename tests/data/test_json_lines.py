@@ -1,7 +1,5 @@
 """Records that come back whatever a kill cut short."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """LeRobot's unmodified library judges what we write, with cameras and without: its writer, its reader and its tools."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Datasets as other people have them: each is opened, has no errors, and is trained on from its pictures."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

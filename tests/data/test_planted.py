@@ -1,7 +1,5 @@
 """What is planted under the name of a file of ours: a link leads to no other file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The dataset that comes along with the project."""
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

@@ -1,7 +1,5 @@
 """Specs and fingerprints: what two sides must share, and how they say so."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

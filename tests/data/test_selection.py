@@ -1,7 +1,5 @@
 """One rollout, several episodes of a dataset: parts, budgets, and the same bytes when it is built again."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

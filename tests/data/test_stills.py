@@ -1,7 +1,5 @@
 """Pictures that are PNGs in the data files come back bit for bit, by our readers and LeRobot's."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

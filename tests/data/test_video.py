@@ -1,7 +1,5 @@
 """Cameras: every row's picture is where the dataset says, and comes back."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """A process in which a page's commands and snippets run, one after the other: its memory goes back with it."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

@@ -1,7 +1,5 @@
 """What README, docs and help tell a user to type: fenced blocks, cut into lines of shell words."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Iterator

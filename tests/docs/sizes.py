@@ -1,7 +1,5 @@
 """The sizes at which the tests run documented commands: every other word stays as it is written."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The folders that documented commands take for granted, each made once, when it is first needed, and small."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Every command line and snippet in README, docs and help runs, verbatim but for sizes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What README and docs mention is there: options, commands, files, headings."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A folder in which the lines of a page are run, one after the other, as a user would."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

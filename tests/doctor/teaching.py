@@ -1,7 +1,5 @@
 """Datasets as a teacher records them: joints that follow their targets, a gripper, cameras that see the hand move."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Sixteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found, and nothing else."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Callable

@@ -4,8 +4,6 @@ Others are shown beside what they concern: fps 29.97 and exchanged messages in `
 and its card in `tests/store/test_cards.py`, datasets of every shape that is trained on in `tests/data`.
 """
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

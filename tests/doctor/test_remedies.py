@@ -1,7 +1,5 @@
 """What a finding says to do helps: repair from journals or from the data, or LeRobot's tool."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import shutil

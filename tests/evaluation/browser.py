@@ -1,7 +1,5 @@
 """A headless Chromium that opens a file as people would, and what it notices meanwhile."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Evaluations with conditions and phases, made without running anything."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A report's page as a test reads it, and what holds for every page."""
 
-from __future__ import annotations
-
 import base64
 import re
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """Reports in a real headless Chromium: quiet, whole without a network, and fitting wide and narrow windows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a certificate says is what the simulator does, and it does not fall."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

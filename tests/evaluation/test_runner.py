@@ -1,7 +1,5 @@
 """An evaluation's outcomes belong to their seeds, and it stops where it says it does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """What runs in the children of tests."""
 
-from __future__ import annotations
-
 import gc
 import os
 import resource

@@ -1,7 +1,5 @@
 """A disk that fills up ends a command with one clear line, and nothing that was finished is lost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`record`, `dagger` and `eval`, killed at any moment and again and again, lose what was in progress and no more."""
 
-from __future__ import annotations
-
 import json
 import os
 import time

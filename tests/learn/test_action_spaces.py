@@ -1,7 +1,5 @@
 """One dataset is learnt in any action space, and what comes out is joint targets again."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

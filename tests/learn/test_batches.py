@@ -1,7 +1,5 @@
 """Rows in their order, and crops and colour jitter of pictures: draws are the generator's or the seed's alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

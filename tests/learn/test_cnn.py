@@ -1,7 +1,5 @@
 """The cnn policy: keypoints that point, LeRobot's way in and out, and labels and truth that only training sees."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

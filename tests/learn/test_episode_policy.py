@@ -1,7 +1,5 @@
 """LeRobot's policies in many episodes at once act in each as LeRobot has them act in one."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Exported policies act as the checkpoint does, for any number of rows, and say what their numbers mean."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Options of LeRobot's, by its names: of policies, optimisers and schedules, and what a policy sees."""
 
-from __future__ import annotations
-
 import pytest
 from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from lerobot.policies.act.configuration_act import ACTConfig

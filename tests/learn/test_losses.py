@@ -1,7 +1,5 @@
 """Each loss is the likelihood it says it is, and only the right ones can hold two ways at once."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import distributions as td

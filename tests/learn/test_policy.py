@@ -1,7 +1,5 @@
 """Acting: through LeRobot and past it the same; a row does not feel its company."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Samples are windows of one episode, of one dataset or of several."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Training is a function of data, options and seed, for every kind of policy; it refuses what it cannot learn from."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """Checkpoints of LeRobot's policies, small and untrained, as LeRobot itself writes them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

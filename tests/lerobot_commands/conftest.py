@@ -1,7 +1,5 @@
 """LeRobot's commands as processes of their own, forked from one that has imported LeRobot and nothing of ours."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The environment as LeRobot's code sees it."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

@@ -1,7 +1,5 @@
 """LeRobot's commands with cameras: OpenGL in their processes and in those of their environments."""
 
-from __future__ import annotations
-
 import json
 
 import av

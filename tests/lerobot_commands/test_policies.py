@@ -1,7 +1,5 @@
 """lerobot-train and lerobot-eval on our datasets, policies and environments: the same success for every seed."""
 
-from __future__ import annotations
-
 import pytest
 
 from manip_il.cli.main import main

@@ -1,7 +1,5 @@
 """A simulated SO-101 and the real one in LeRobot's commands: one dataset of both, and a policy of ours on its arm."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

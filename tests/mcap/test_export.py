@@ -1,7 +1,5 @@
 """Out to MCAP and in again: equal numbers, equal pictures, whoever wrote the dataset."""
 
-from __future__ import annotations
-
 import shutil
 from fractions import Fraction
 from pathlib import Path

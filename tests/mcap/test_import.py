@@ -1,7 +1,5 @@
 """MCAP to episodes: every value from a message that the mapping allows, or an error that says where and when."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A mapping is its file, and a path leads to values; what is wrong is said by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """What tests of MCAP share: messages as others decode them, mappings, and files of messages."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Datasets whose progress is known, without a simulator: an object is brought along one axis, well or badly."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The asking page in a real headless Chromium: keys, taps, undo, and what is kept and saved."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The commands: from datasets to a reward, scores and a weighted clone; bad input is one line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The Bradley-Terry reward: what it learns, that it is the same everywhere, and what a folder of it may hold."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which clips are compared, and what a file of pairs may hold."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from types import SimpleNamespace

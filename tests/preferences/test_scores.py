@@ -1,7 +1,5 @@
 """Scores of episodes, weights of frames, and that LeRobot takes them as its own."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

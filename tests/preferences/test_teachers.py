@@ -1,7 +1,5 @@
 """Simulated teachers, and answers joined."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small worlds for inverse reinforcement learning: grids with things on them, and demonstrations of a known taste."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

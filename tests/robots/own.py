@@ -1,7 +1,5 @@
 """An arm of a user's own: one YAML and one MJCF, which brings a world of its own along as models from outside do."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

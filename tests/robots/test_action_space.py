@@ -1,7 +1,5 @@
 """An action is joint targets and one opening, by name and within bounds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Cameras and table of the scene stand where a robot's YAML says."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

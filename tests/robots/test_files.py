@@ -1,7 +1,5 @@
 """Where a model's files are found."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

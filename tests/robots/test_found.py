@@ -1,7 +1,5 @@
 """What a robot's YAML need not say, found on its model."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A gripper is an opening [m] between pads, whatever drives the fingers."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from pathlib import Path

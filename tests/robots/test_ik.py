@@ -1,7 +1,5 @@
 """Inverse kinematics solves the quadratic program that mink builds of its tasks and limits, bit for bit."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import daqp

@@ -1,7 +1,5 @@
 """Models as others write them: in degrees, as URDF, with bodies turned in every way, with a scene around them."""
 
-from __future__ import annotations
-
 import math
 import re
 import xml.etree.ElementTree as ET

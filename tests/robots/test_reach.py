@@ -1,7 +1,5 @@
 """The map of where a hand gets to is made of solutions of inverse kinematics, worked out once and kept."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A robot is one YAML beside its model; what is wrong in either is one line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """SO-101 speaks as the real one does in LeRobot: its names, degrees, 0 to 100, 30 frames a second."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

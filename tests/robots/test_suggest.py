@@ -1,7 +1,5 @@
 """A first YAML for an arm, from its MJCF."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

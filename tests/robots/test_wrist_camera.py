@@ -1,7 +1,5 @@
 """The wrist camera sees both fingers on every arm, open, half open and closed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import mujoco

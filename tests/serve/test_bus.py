@@ -1,7 +1,5 @@
 """The serial protocol and the registers, as Feetech's servos have them."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import threading

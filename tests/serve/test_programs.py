@@ -1,7 +1,5 @@
 """LeRobot's own programs, unmodified, run to their end against the arm: their keys are pressed for them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

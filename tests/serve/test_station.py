@@ -1,7 +1,5 @@
 """A simulated arm behind its ports: LeRobot's own drivers, unmodified, and what the world does meanwhile."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

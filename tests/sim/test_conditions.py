@@ -1,7 +1,5 @@
 """Conditions: ranges that refuse themselves, and draws that belong to their seed and their name."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """The environment is gymnasium's, and a function of its state and the actions."""
 
-from __future__ import annotations
-
 import itertools
 
 import gymnasium

@@ -1,7 +1,5 @@
 """Environments under conditions: physics has the drawn cube, observations and pictures what was drawn for them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

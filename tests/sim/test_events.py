@@ -1,7 +1,5 @@
 """Events change what they say by what they say, once, and leave a world that can be."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Named points of the scene are where pictures show them."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """What a learner is shown: numbers that are what their names say."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A posture to begin in: near home, touching nothing, the hand within reach, by the episode's seed alone."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from manip_il.sim import events

@@ -1,7 +1,5 @@
 """A goal stands on something, clutter lies around the workspace, and neither touches anything."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pictures show the scene; where there is no OpenGL the error says what to install."""
 
-from __future__ import annotations
-
 import multiprocessing
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor

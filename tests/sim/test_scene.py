@@ -1,7 +1,5 @@
 """Bodies, contacts and the gripper's hold."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

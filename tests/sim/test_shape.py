@@ -1,7 +1,5 @@
 """Shapes of objects as text, and what they weigh."""
 
-from __future__ import annotations
-
 import mujoco
 import pytest
 

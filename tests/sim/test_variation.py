@@ -1,7 +1,5 @@
 """A variation is five numbers an object (half its lengths, its mass, its friction), and what the world draws."""
 
-from __future__ import annotations
-
 import copy
 
 import mujoco

@@ -1,7 +1,5 @@
 """The model that is drawn has the physics model's poses and outlines, and few triangles."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

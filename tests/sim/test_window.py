@@ -1,7 +1,5 @@
 """`render_mode="human"` shows every step in a window, or says what is missing."""
 
-from __future__ import annotations
-
 import gymnasium
 import pytest
 

@@ -1,7 +1,5 @@
 """A world is one scene in one state, asked by name; its model is its own only where it was varied."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """An empty place on every kind of remote, a Hub, and runs to push."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

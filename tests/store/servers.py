@@ -1,7 +1,5 @@
 """Servers on loopback: a Hub in memory, moto's S3, and Debian's sshd with nothing of the machine's own."""
 
-from __future__ import annotations
-
 import base64
 import getpass
 import hashlib

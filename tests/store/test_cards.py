@@ -1,7 +1,5 @@
 """Cards: valid for the Hub, the same every time, silent about places and secrets, and honest about who made what."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """kill -9 at random moments, in either direction: readers see a whole version, and the next try succeeds."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import time

@@ -1,7 +1,5 @@
 """What comes from outside: verified, kept inside the folder, never run; and mistakes, in one line without secrets."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import json

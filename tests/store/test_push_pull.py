@@ -1,7 +1,5 @@
 """What is pulled is what was pushed; what has not changed does not travel; readers see one version or the other."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The drawer, where the cube lies in the way of its handle."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

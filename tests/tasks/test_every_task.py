@@ -1,7 +1,5 @@
 """What holds for every task on every robot: its ladder, its progress, its end, its name in a fingerprint."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """How shapes lie, and where a hand that points down grasps them."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The task `insert`: where the peg starts, how the hand turns it, and that it ends up in the hole."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Objects that are meshes: read from a file, grasped on any side that they rest on, named in data without a path."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 from pathlib import Path

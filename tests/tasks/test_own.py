@@ -1,7 +1,5 @@
 """A task from a file: it runs in every command that names its path, and never because data name it."""
 
-from __future__ import annotations
-
 import pickle
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sort: what is named is a function of the state, in words and in numbers, and the other cubes are left alone."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

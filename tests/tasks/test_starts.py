@@ -1,7 +1,5 @@
 """Where objects and goals start."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The two arms of gym_aloha: as gymnasium makes them, restored bit for bit, and solved by their experts."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

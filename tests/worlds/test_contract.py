@@ -1,7 +1,5 @@
 """The contract of a world, kept by each kind: what is named is there, and what it cannot do it says in one line."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fetch's environments: as gymnasium makes them, restored bit for bit, and solved by their experts."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest

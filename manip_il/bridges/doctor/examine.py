@@ -1,7 +1,5 @@
 """Run every check on a dataset, and repair it from its journals or its own data."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """What a finding is, and checks that files agree: `info.json`, episodes, tasks, statistics, rows, videos."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterator
 from contextlib import closing

@@ -3,8 +3,6 @@
 Motions are checked in episodes driven by a teacher; if a learner drives, actions are labels that were not executed.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 

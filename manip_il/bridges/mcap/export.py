@@ -4,8 +4,6 @@ States and actions become `foxglove.JointStates`, other numbers LeRobot's scalar
 text `foxglove.Log`. With `mapping.yaml`, next to the files, an import recreates the dataset.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

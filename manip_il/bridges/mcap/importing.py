@@ -4,8 +4,6 @@ An episode lasts from the time when all topics have started to the time when the
 are read by the library's reader and decoders.
 """
 
-from __future__ import annotations
-
 import importlib
 import itertools
 import json

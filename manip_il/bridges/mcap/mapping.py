@@ -5,8 +5,6 @@ selects every element of a list, `[name=elbow]` the one whose name is elbow. A n
 and square brackets, the text after `=` any except a closing bracket.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

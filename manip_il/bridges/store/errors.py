@@ -1,7 +1,5 @@
 """Errors of remotes: one line with a remedy, without tokens, keys or passwords."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Generator, Iterable

@@ -8,8 +8,6 @@ The card, `README.md`, is made from `card.md.jinja`. It holds no absolute path, 
 gives the same bytes. A card of another program's dataset or policy claims neither our licence nor our authorship.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 import tempfile

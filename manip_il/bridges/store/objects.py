@@ -7,8 +7,6 @@ Objects of the previous version stay until the next push, so that its readers ca
 nothing else is ever removed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import re

@@ -1,7 +1,5 @@
 """Push a folder to a remote, checked and visible only when complete; pull it back, verified, in one rename."""
 
-from __future__ import annotations
-
 import filecmp
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The page that asks people to compare two films side by side: one self-contained HTML file."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 from collections.abc import Callable

@@ -9,8 +9,6 @@ out from one of the networks.
 that are random, whatever the clips.)
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable

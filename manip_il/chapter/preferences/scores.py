@@ -8,8 +8,6 @@ failing episodes also approach the goal at first. The score at the episode's end
 It rises throughout an episode that ends near the best quarter, and falls throughout the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

@@ -10,8 +10,6 @@ over longer and longer paths, relative to the cheapest path's cost to avoid unde
 neighbours takes 5 ms, a sparse LU decomposition of I - M 170 ms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ Each demonstration must be cheaper than every other path by a margin that grows 
 the demonstration's features minus those of the path that is cheapest after the margin is subtracted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -11,8 +11,6 @@ A policy is an array (H, S): the probability of a wrong action at each step in e
 are (..., H, S).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property

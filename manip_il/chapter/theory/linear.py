@@ -7,8 +7,6 @@ exponential growth for smooth deterministic imitators in general. Noise on the d
 show corrections, is DART (Laskey et al. 2017).
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The report and the JSON file of `manip-il theory`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ training data were, and how much more it costs than the expert, compared with Th
 Costs are control steps until the task is solved, or the horizon if it is not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

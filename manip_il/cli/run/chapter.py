@@ -5,8 +5,6 @@ Run `manip-il reward irl`: learn a reward from demonstrations.
 Run `manip-il data score`: score a dataset's episodes by a reward.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from manip_il.chapter import inverse

@@ -3,8 +3,6 @@
 Run `manip-il data check`, `repair`: find errors in a dataset, and repair them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Run `manip-il eval`: how often a policy succeeds on unseen seeds."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 from pathlib import Path

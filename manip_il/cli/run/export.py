@@ -1,7 +1,5 @@
 """Run `manip-il export`: a policy as one ONNX file."""
 
-from __future__ import annotations
-
 from manip_il.cli.progress import say
 from manip_il.cli.transfer import ExportOptions
 from manip_il.data.atomic import write_file

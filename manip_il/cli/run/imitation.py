@@ -5,8 +5,6 @@ Run `manip-il demo`: demonstrations, cloning, DAgger, and a report that compares
 Run `manip-il compare`: two policies or runs on the same seeds, or a study.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Run `manip-il rl gail`, `airl`, `ppo`: reinforcement learning from demonstrations or a learnt reward."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Run `manip-il data to-mcap`, `from-mcap`: convert datasets."""
 
-from __future__ import annotations
-
 from manip_il.bridges.mcap.export import export_dataset, left_out
 from manip_il.bridges.mcap.importing import import_files, list_files
 from manip_il.bridges.mcap.mapping import load_mapping

@@ -1,7 +1,5 @@
 """Run `manip-il record`: a dataset of the expert's demonstrations."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from manip_il import checks

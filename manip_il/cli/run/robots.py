@@ -1,7 +1,5 @@
 """Run `manip-il robot new`, `check`, `certify`."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 

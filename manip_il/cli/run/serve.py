@@ -1,7 +1,5 @@
 """Run `manip-il serve`: a virtual SO-101 behind serial ports, for LeRobot's own programs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Run `manip-il theory`: the proven bounds of cloning and DAgger, on small MDPs and on the rounds of a run."""
 
-from __future__ import annotations
-
 from itertools import chain
 from pathlib import Path
 

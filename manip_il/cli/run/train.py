@@ -1,7 +1,5 @@
 """Run `manip-il train`: behaviour cloning on datasets, with our policies and LeRobot's."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 

@@ -1,7 +1,5 @@
 """Run `manip-il push`, `pull`: move datasets and policies."""
 
-from __future__ import annotations
-
 from rich import filesize
 
 from manip_il.bridges.store.transfer import open_remote, pull, push

@@ -1,7 +1,5 @@
 """Run `manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun if there is no display."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 from dataclasses import replace

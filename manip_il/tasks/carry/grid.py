@@ -8,8 +8,6 @@ Paths to a goal on a graph whose edges have features: weights turn features into
 Demonstrations are paths to the goal. Weights are inferred by comparing each demonstration with alternative paths.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache

@@ -1,7 +1,5 @@
 """Bodies of `carry`'s obstacles, a world's layout and reward, and the parts of a hand that may hit an obstacle."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache

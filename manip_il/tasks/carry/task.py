@@ -4,8 +4,6 @@ The path is planned for the object's centre, on a grid over the free space of th
 are part of the state, as positions of invisible mocap bodies, so that a label is a function of the state.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """One environment of `gym_aloha`, unmodified, behind the contract of a world."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib import import_module
 from typing import Any, override

@@ -1,7 +1,5 @@
 """The expert of two arms: one label for both hands, a function of the state alone."""
 
-from __future__ import annotations
-
 import math
 from importlib import import_module
 from typing import override

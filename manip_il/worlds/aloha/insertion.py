@@ -1,7 +1,5 @@
 """The left hand takes the socket and the right one the peg; they meet in the air, and the peg goes in."""
 
-from __future__ import annotations
-
 import math
 from functools import cached_property
 

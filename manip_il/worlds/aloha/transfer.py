@@ -1,7 +1,5 @@
 """The right hand takes the cube from the table and hands it to the left one, in the air."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

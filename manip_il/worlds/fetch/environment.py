@@ -1,7 +1,5 @@
 """One Fetch environment of gymnasium-robotics, unmodified, behind the contract of a world."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from dataclasses import dataclass, replace

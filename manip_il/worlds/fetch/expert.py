@@ -5,8 +5,6 @@ action of 1 moves the gripper by about `REACH` in a control step along each axis
 x, y and z determines how long a move takes.
 """
 
-from __future__ import annotations
-
 import itertools
 from typing import override
 

@@ -1,7 +1,5 @@
 """The expert: a function of `State` alone, which labels any state that a learner reaches."""
 
-from __future__ import annotations
-
 import math
 from typing import override
 

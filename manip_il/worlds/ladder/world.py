@@ -5,8 +5,6 @@ New scenes from visited states: new goals, and new places of untouched objects.
 Scenes and environments by the names of robot and task.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Mapping, Sequence

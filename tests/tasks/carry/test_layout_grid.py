@@ -1,7 +1,5 @@
 """The grid of `carry`: costs are those of paths, paths keep off obstacles, their features are line integrals."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

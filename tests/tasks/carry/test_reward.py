@@ -1,7 +1,5 @@
 """Rewards of `carry`: read from a name, a file or a text, refused in one line, and kept as numbers."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

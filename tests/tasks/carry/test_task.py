@@ -1,7 +1,5 @@
 """Carry: nothing is touched, the way is a reward's, and the reward is part of the state but is not observed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
