@@ -1,8 +1,9 @@
-"""Time that the `imitation` library takes to clone 200 demonstrations of gymnasium-robotics' FetchPickAndPlace.
+"""Time that the `imitation` library takes to clone 200 demonstrations of gymnasium-robotics'
+FetchPickAndPlace.
 
-Run by `time_to_policy.py` in a separate environment, as `imitation` needs other versions than this project; prints one
-line of JSON. Demonstrations are from a scripted expert of four rules, collected in two processes; success is measured
-at the last step, on 200 unseen seeds.
+Run by `time_to_policy.py` in a separate environment, as `imitation` needs other versions than this
+project; prints one line of JSON. Demonstrations are from a scripted expert of four rules, collected
+in two processes; success is measured at the last step, on 200 unseen seeds.
 """
 
 import json
@@ -21,7 +22,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 TASK, DEMONSTRATIONS, EPISODES = "FetchPickAndPlace-v2", 200, 200
-GOAL, GRIPPER, CUBE, FINGERS = slice(3, 6), slice(6, 9), slice(9, 12), slice(15, 17)  # slices of the flat observation
+# slices of the flat observation
+GOAL, GRIPPER, CUBE, FINGERS = slice(3, 6), slice(6, 9), slice(9, 12), slice(15, 17)
 OPEN, CLOSE, STEP = 1.0, -1.0, 0.1  # STEP: displacement by an action of 1, approximately [m]
 
 
@@ -31,7 +33,10 @@ def expert(seen: np.ndarray) -> np.ndarray:
     for one in seen:
         to_cube = one[CUBE] - one[GRIPPER]
         is_closed = one[FINGERS].sum() < 0.052
-        is_over, is_at = np.hypot(*to_cube[:2]) < 0.015, abs(to_cube[2]) < (0.03 if is_closed else 0.01)
+        is_over, is_at = (
+            np.hypot(*to_cube[:2]) < 0.015,
+            abs(to_cube[2]) < (0.03 if is_closed else 0.01),
+        )
         if not is_over:
             way, fingers = to_cube + [0, 0, 0.06], OPEN
         elif not is_at:
@@ -57,9 +62,16 @@ def main() -> None:
     envs.seed(seed * 1_000_000)
     enough = rollout.make_sample_until(min_episodes=DEMONSTRATIONS)
     demonstrations = rollout.rollout(
-        lambda seen, state, done: (expert(seen), None), envs, enough, rng, unwrap=False, exclude_infos=True
+        lambda seen, state, done: (expert(seen), None),
+        envs,
+        enough,
+        rng,
+        unwrap=False,
+        exclude_infos=True,
     )
-    policy = ActorCriticPolicy(envs.observation_space, envs.action_space, lambda _: 1e-3, net_arch=[256, 256])
+    policy = ActorCriticPolicy(
+        envs.observation_space, envs.action_space, lambda _: 1e-3, net_arch=[256, 256]
+    )
     trainer = BC(
         observation_space=envs.observation_space,
         action_space=envs.action_space,
@@ -71,7 +83,15 @@ def main() -> None:
     )
     trainer.train(n_epochs=epochs, progress_bar=False, log_interval=10_000)
     seconds = time.perf_counter() - started
-    print(json.dumps({"seconds": seconds, "labels": sum(map(len, demonstrations)), "success": success(policy)}))
+    print(
+        json.dumps(
+            {
+                "seconds": seconds,
+                "labels": sum(map(len, demonstrations)),
+                "success": success(policy),
+            }
+        )
+    )
 
 
 def success(policy: ActorCriticPolicy) -> float:

@@ -12,7 +12,10 @@ def describe_machine() -> str:
     """Return one line: cores that this process may use, CPU model, load, versions."""
     versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
-    return f"{cores} cores of {_cpu_model()}, load {load:.1f}; Python {platform.python_version()}, {versions}"
+    return (
+        f"{cores} cores of {_cpu_model()}, load {load:.1f}; Python {platform.python_version()},"
+        f" {versions}"
+    )
 
 
 def _cpu_model() -> str:

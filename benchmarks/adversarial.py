@@ -3,14 +3,15 @@
 python benchmarks/adversarial.py [--seeds 10] [--env NAME] [--algorithm gail|airl] [--quick]
 
 The loops are those of `manip_il.chapter.learning`, with the same discriminators, PPO and network as
-for robots. Every training seed begins with a new policy and its own demonstrations; its last policy acts without
-exploring on 100 episodes, the same for all. With the mean returns R, the share is
+for robots. Every training seed begins with a new policy and its own demonstrations; its last policy
+acts without exploring on 100 episodes, the same for all. With the mean returns R, the share is
 
     (R of the policy - R of random actions) / (R of the expert - R of random actions)
 
-as in the imitation library's table (Gleave et al., imitation: Clean imitation learning implementations, 2022). Random
-actions are uniform. Limits on the interquartile mean over seeds, in each environment and in both together (Agarwal et
-al., Deep reinforcement learning at the edge of the statistical precipice, 2021): 0.95 for GAIL, 0.90 for AIRL.
+as in the imitation library's table (Gleave et al., imitation: Clean imitation learning
+implementations, 2022). Random actions are uniform. Limits on the interquartile mean over seeds, in
+each environment and in both together (Agarwal et al., Deep reinforcement learning at the edge of
+the statistical precipice, 2021): 0.95 for GAIL, 0.90 for AIRL.
 """
 
 from __future__ import annotations
@@ -41,11 +42,14 @@ F32, F64 = NDArray[np.float32], NDArray[np.float64]
 Acting = Callable[[F32], F32]  # raw inputs (B, d) to raw targets (B, 1)
 LOOPS: dict[str, Callable[..., Iterator[Any]]] = {"gail": gail, "airl": airl}
 LIMITS = {"gail": 0.95, "airl": 0.90}
-_TORQUE, _GRAVITY, _TOP = 2.0, 10.0, 0.5  # Pendulum-v1's [N m], [m/s^2]; angle at which the expert balances [rad]
+# Pendulum-v1's [N m], [m/s^2]; angle at which the expert balances [rad]
+_TORQUE, _GRAVITY, _TOP = 2.0, 10.0, 0.5
 
 
 class Pendulum:
-    """Pendulum-v1: observes cos and sin of the angle from the top, and the speed [rad/s]; targets are torques [N m].
+    """Pendulum-v1: observes cos and sin of the angle from the top, and the speed [rad/s].
+
+    Targets are torques [N m].
 
     Every episode has 200 steps; nothing ends or solves it.
     """
@@ -68,12 +72,18 @@ class Pendulum:
 
     @staticmethod
     def expert(inputs: F32) -> F32:
-        """Pump energy up to that of resting at the top, and balance there by feedback (Astrom & Furuta, 2000)."""
+        """Pump energy up to that of resting at the top, and balance there by feedback (Astrom &
+        Furuta, 2000).
+        """
         angle, speed = np.arctan2(inputs[:, 1], inputs[:, 0]), inputs[:, 2]
         energy = speed**2 / 6 + _GRAVITY / 2 * (inputs[:, 0] - 1)  # [J], 0 at the top
         pumping = np.where(speed >= 0, -1.0, 1.0) * energy * 10
         balancing = -(15.0 * angle + 4.0 * speed)
-        return np.where(np.abs(angle) < _TOP, balancing, pumping).clip(-_TORQUE, _TORQUE).astype(np.float32)[:, None]
+        return (
+            np.where(np.abs(angle) < _TOP, balancing, pumping)
+            .clip(-_TORQUE, _TORQUE)
+            .astype(np.float32)[:, None]
+        )
 
     @staticmethod
     def random(inputs: F32, rng: np.random.Generator) -> F32:
@@ -81,9 +91,12 @@ class Pendulum:
 
 
 class CartPole:
-    """CartPole-v1: observes position, velocity, angle and angular velocity; the sign of a target is the push direction.
+    """CartPole-v1: observes position, velocity, angle and angular velocity.
 
-    An episode has 500 steps, each with a reward of 1; a fall ends it early, in a state that no demonstration has.
+    The sign of a target is the push direction.
+
+    An episode has 500 steps, each with a reward of 1; a fall ends it early, in a state that no
+    demonstration has.
     """
 
     name, steps = "CartPole-v1", 500
@@ -109,19 +122,25 @@ class CartPole:
     @staticmethod
     def expert(inputs: F32) -> F32:
         """Push against the weighted sum of errors, as a linear controller does: 1 or -1."""
-        return np.where(inputs @ np.array([0.3, 0.7, 10.0, 2.0], np.float32) > 0, 1.0, -1.0).astype(np.float32)[:, None]
+        return np.where(inputs @ np.array([0.3, 0.7, 10.0, 2.0], np.float32) > 0, 1.0, -1.0).astype(
+            np.float32
+        )[:, None]
 
     @staticmethod
     def random(inputs: F32, rng: np.random.Generator) -> F32:
         return rng.choice(np.array([-1.0, 1.0], np.float32), (len(inputs), 1))
 
 
-ENVIRONMENTS: dict[str, type[Pendulum] | type[CartPole]] = {one.name: one for one in (Pendulum, CartPole)}
+ENVIRONMENTS: dict[str, type[Pendulum] | type[CartPole]] = {
+    one.name: one for one in (Pendulum, CartPole)
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Hyperparameters of a run, named as in `LearningConfig`. demonstrations: episodes of `episode_steps`."""
+    """Hyperparameters of a run, named as in `LearningConfig`. demonstrations: episodes of
+    `episode_steps`.
+    """
 
     steps: int
     episodes: int = 16
@@ -173,7 +192,9 @@ class Run:
         count = self._settings.episodes
         self._number += 1
         seed_generators(self._stream("rollouts"))
-        rows = self._learner.collect(stream_seeds("reinforcement", (self._number + 1) * count, self._seed)[-count])
+        rows = self._learner.collect(
+            stream_seeds("reinforcement", (self._number + 1) * count, self._seed)[-count]
+        )
         self.simulated += self._envs.simulated
         return rows
 
@@ -200,15 +221,23 @@ class Run:
 
     def _stream(self, purpose: str) -> int:
         """Return a seed for one purpose in an iteration."""
-        return int(rng_for(stream_base("reinforcement", self._seed) + self._number, purpose).integers(2**63))
+        return int(
+            rng_for(stream_base("reinforcement", self._seed) + self._number, purpose).integers(
+                2**63
+            )
+        )
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", type=int, default=10, help="training seeds, from 0 on")
     parser.add_argument("--env", choices=[*ENVIRONMENTS], help="by default both")
     parser.add_argument("--algorithm", choices=[*LOOPS], help="by default both")
-    parser.add_argument("--quick", action="store_true", help="a few of each: shows that it runs, measures nothing")
+    parser.add_argument(
+        "--quick", action="store_true", help="a few of each: shows that it runs, measures nothing"
+    )
     options = parser.parse_args()
     if options.seeds < 1:
         parser.error(f"--seeds is {options.seeds}; expected at least 1")
@@ -224,26 +253,47 @@ def main() -> int:
     return int(any(missed) and not options.quick)
 
 
-def measure(algorithm: str, ends: dict[str, tuple[float, float]], seeds: Sequence[int], *, quick: bool) -> bool:
-    """Print shares per environment and overall; return whether a limit was missed. ends: see `references`."""
+def measure(
+    algorithm: str, ends: dict[str, tuple[float, float]], seeds: Sequence[int], *, quick: bool
+) -> bool:
+    """Print shares per environment and overall.
+
+    Return whether a limit was missed. ends: see `references`.
+    """
     shares: dict[str, list[float]] = {}
     for name, (random, expert) in ends.items():
         begin, settings = time.process_time(), replace(SETTINGS[name], **(_QUICK if quick else {}))
-        returns = [mean_return(name, trained(algorithm, name, settings, seed), quick) for seed in seeds]
+        returns = [
+            mean_return(name, trained(algorithm, name, settings, seed), quick) for seed in seeds
+        ]
         seconds = (time.process_time() - begin) / len(seeds)
         shares[name] = [(one - random) / (expert - random) for one in returns]
-        print(f"{algorithm}, {name}: return of random actions {random:.1f}, of the expert {expert:.1f}")
-        print(f"   {settings.demonstrations} demonstrations, {settings.steps:,} steps, {seconds:.0f} s a seed")
+        print(
+            f"{algorithm}, {name}: return of random actions {random:.1f}, of the expert"
+            f" {expert:.1f}"
+        )
+        print(
+            f"   {settings.demonstrations} demonstrations, {settings.steps:,} steps, {seconds:.0f}"
+            " s a seed"
+        )
         print("   shares of seeds: " + " ".join(f"{one:.3f}" for one in shares[name]))
     together = [one for several in shares.values() for one in several]
-    return any([_missed(algorithm, name, several) for name, several in {**shares, "together": together}.items()])
+    return any(
+        [
+            _missed(algorithm, name, several)
+            for name, several in {**shares, "together": together}.items()
+        ]
+    )
 
 
 def _missed(algorithm: str, name: str, shares: Sequence[float]) -> bool:
     """Print the interquartile mean of shares beside its limit; return whether it is below."""
     middle, limit = float(trim_mean(shares, 0.25)), LIMITS[algorithm]
     low, high = np.percentile(shares, [25, 75])
-    print(f"{algorithm}, {name}: interquartile mean {middle:.3f} ({low:.3f} to {high:.3f}), limit {limit:.2f}")
+    print(
+        f"{algorithm}, {name}: interquartile mean {middle:.3f} ({low:.3f} to {high:.3f}), limit"
+        f" {limit:.2f}"
+    )
     return middle < limit
 
 
@@ -258,12 +308,16 @@ def trained(algorithm: str, name: str, settings: Settings, seed: int) -> Acting:
 def references(name: str, quick: bool) -> tuple[float, float]:
     """Return the mean returns of random actions and of the expert."""
     made, rng = ENVIRONMENTS[name], rng_for(stream_base("test"), name)
-    return mean_return(name, lambda inputs: made.random(inputs, rng), quick), mean_return(name, made.expert, quick)
+    return mean_return(name, lambda inputs: made.random(inputs, rng), quick), mean_return(
+        name, made.expert, quick
+    )
 
 
 def mean_return(name: str, acting: Acting, quick: bool) -> float:
     """Return the mean return over whole episodes, the same for all policies."""
-    _, _, returns = play(name, acting, stream_seeds("test", 2 if quick else 100), ENVIRONMENTS[name].steps)
+    _, _, returns = play(
+        name, acting, stream_seeds("test", 2 if quick else 100), ENVIRONMENTS[name].steps
+    )
     return float(returns.mean())
 
 

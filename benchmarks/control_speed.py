@@ -2,9 +2,9 @@
 
 python benchmarks/control_speed.py [--quick]
 
-Ours is a step of a recording rollout: observe, read the state, label it, advance. The limit is `mj_step` alone,
-replaying the same controls from the same starts. Both alternate episode by episode in the same run; the result is the
-median ratio over the repeats.
+Ours is a step of a recording rollout: observe, read the state, label it, advance. The limit is
+`mj_step` alone, replaying the same controls from the same starts. Both alternate episode by episode
+in the same run; the result is the median ratio over the repeats.
 """
 
 import argparse
@@ -25,12 +25,19 @@ STEPS = 30  # steps per episode: how many the expert takes from the start to the
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few episodes: shows that it runs, measures little")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="few episodes: shows that it runs, measures little"
+    )
     options = parser.parse_args()
     episodes, repeats = (3, 3) if options.quick else (30, 7)
     print(describe_machine())
-    print("robot  labelled control steps/s  raw physics, control steps/s  share of raw (median, all repeats)")
+    print(
+        "robot  labelled control steps/s  raw physics, control steps/s  share of raw (median, all"
+        " repeats)"
+    )
     for robot in ROBOTS:
         env = make_env(robot, "pick_place")
         expert = Expert(env.scene)
@@ -53,7 +60,10 @@ def repeat(env: ManipEnv, expert: Expert, episodes: int) -> tuple[float, float]:
         ours += seconds
         raw += replay_seconds(env, replay, controls)
         if not np.array_equal(replay.qpos, env.data.qpos):
-            raise SystemExit(f"seed {seed}: the replay left the recorded trajectory; the two measure different physics")
+            raise SystemExit(
+                f"seed {seed}: the replay left the recorded trajectory; the two measure different"
+                " physics"
+            )
     return episodes * STEPS / ours, episodes * STEPS / raw
 
 

@@ -1,12 +1,14 @@
-"""Evaluation of a state-based policy: control steps per second against raw physics, episodes against lerobot-eval.
+"""Evaluation of a state-based policy: control steps per second against raw physics, episodes
+against lerobot-eval.
 
 python benchmarks/eval_speed.py [--quick]
 
-The limit is `mj_step` alone, replaying the same controls from the same starts on one core, alternating in the same run;
-the result is the median ratio over the repeats. The peer is the whole command `lerobot-eval`, with videos off, on the
-same checkpoint and seeds, in the faster of its two modes (environments in its own process, or in processes of their
-own), against the whole command `manip-il eval`; both may use every core. Outcomes must agree seed by seed, except for a
-diffusion policy (`configs/diffusion_state.yaml`, a tenth of its steps), which draws from its own seeds.
+The limit is `mj_step` alone, replaying the same controls from the same starts on one core,
+alternating in the same run; the result is the median ratio over the repeats. The peer is the whole
+command `lerobot-eval`, with videos off, on the same checkpoint and seeds, in the faster of its two
+modes (environments in its own process, or in processes of their own), against the whole command
+`manip-il eval`; both may use every core. Outcomes must agree seed by seed, except for a diffusion
+policy (`configs/diffusion_state.yaml`, a tenth of its steps), which draws from its own seeds.
 """
 
 import argparse
@@ -42,15 +44,27 @@ BATCH = 50  # lerobot-eval's default batch size; smaller ones took longer
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few episodes: shows that it runs, measures little")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="few episodes: shows that it runs, measures little"
+    )
     quick = parser.parse_args().quick
     print(describe_machine())
     with tempfile.TemporaryDirectory() as folder:
         policies = {robot: fitted(robot, Path(folder) / robot, quick) for robot in ROBOTS}
-        print("robot  control steps/s  raw physics, control steps/s  share of raw (median, all repeats)")
+        print(
+            "robot  control steps/s  raw physics, control steps/s  share of raw (median, all"
+            " repeats)"
+        )
         for robot, policy in policies.items():
-            measured = np.array([against_physics(robot, policy, 5 if quick else 50) for _ in range(2 if quick else 7)])
+            measured = np.array(
+                [
+                    against_physics(robot, policy, 5 if quick else 50)
+                    for _ in range(2 if quick else 7)
+                ]
+            )
             ours, raw = np.median(measured, axis=0)
             shares = measured[:, 0] / measured[:, 1]
             spread = f"{shares.min():.2f} to {shares.max():.2f}"
@@ -64,7 +78,9 @@ def main() -> int:
 
 
 def fitted(robot: str, folder: Path, quick: bool) -> Path:
-    """Return a policy cloned from 200 demonstrations, which solves nearly all episodes, like one in real use."""
+    """Return a policy cloned from 200 demonstrations, which solves nearly all episodes, like one
+    in real use.
+    """
     count, steps = (10, 50) if quick else (200, 4_000)
     config = make_config(robot, TASK)
     demos = RolloutJob(config, hold=5).run(stream_seeds("demonstrations", count))
@@ -102,14 +118,29 @@ def denoising(folder: Path, quick: bool) -> Path:
     """Return a diffusion policy trained on 50 demonstrations."""
     demos, steps = folder / "demos", 2 if quick else 1_600
     config = Path(__file__).parent.parent / "configs" / "diffusion_state.yaml"
-    seconds(["manip-il", "record", f"--dataset.num_episodes={4 if quick else 50}", f"--dataset.root={demos}"])
-    words = ["manip-il", "train", f"--config_path={config}", f"--dataset.root={demos}", f"--steps={steps}"]
+    seconds(
+        [
+            "manip-il",
+            "record",
+            f"--dataset.num_episodes={4 if quick else 50}",
+            f"--dataset.root={demos}",
+        ]
+    )
+    words = [
+        "manip-il",
+        "train",
+        f"--config_path={config}",
+        f"--dataset.root={demos}",
+        f"--steps={steps}",
+    ]
     seconds([*words, f"--output_dir={folder / 'run'}"])
     return folder / "run" / "checkpoints" / "last" / "pretrained_model"
 
 
 def against_lerobot(policy: Path, folder: Path, episodes: int, draws: bool = False) -> None:
-    """Time whole commands, alternating. draws: whether the policy samples, so that outcomes differ."""
+    """Time whole commands, alternating. draws: whether the policy samples, so that outcomes
+    differ.
+    """
     ours: list[float] = []
     theirs: list[float] = []
     success = ""
@@ -134,9 +165,13 @@ def against_lerobot(policy: Path, folder: Path, episodes: int, draws: bool = Fal
 
 
 def ours_words(policy: Path, out: Path, episodes: int) -> list[str]:
-    return ["manip-il", "eval", f"--policy.path={policy}", f"--eval.n_episodes={episodes}", "--eval.films=0"] + [
-        f"--output_dir={out}"
-    ]
+    return [
+        "manip-il",
+        "eval",
+        f"--policy.path={policy}",
+        f"--eval.n_episodes={episodes}",
+        "--eval.films=0",
+    ] + [f"--output_dir={out}"]
 
 
 def lerobot_words(policy: Path, out: Path, episodes: int, asynchronous: bool) -> list[str]:
@@ -160,7 +195,11 @@ def seconds(words: list[str]) -> float:
     environment = os.environ | {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": ""}
     started = time.perf_counter()
     done = subprocess.run(
-        [str(BIN / words[0]), *words[1:]], capture_output=True, text=True, env=environment, check=False
+        [str(BIN / words[0]), *words[1:]],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
     )
     if done.returncode:
         raise SystemExit(f"{' '.join(words)} failed:\n{(done.stdout + done.stderr)[-3000:]}")

@@ -1,7 +1,7 @@
 """What a `cnn` sees in scenes that it was not trained on: errors of its predicted state.
 
-Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET, with a dataset from `manip-il data redraw` that has another
-seed.
+Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET, with a dataset from `manip-il data
+redraw` that has another seed.
 """
 
 import sys
@@ -29,7 +29,9 @@ def batch_of(root: Path, cameras: tuple[str, ...], rows: NDArray[np.int64]) -> B
 
 
 def read_off(policy: CNNPolicy, batch: Batch) -> torch.Tensor:
-    """Return `observation.environment_state` as predicted from pictures and joints, (B, k), in its own units."""
+    """Return `observation.environment_state` as predicted from pictures and joints, (B, k), in
+    its own units.
+    """
     found, moves = policy.network_inputs(batch)[:, policy.seen_size :], policy.truth_scale > 0
     return policy.truth_mean + torch.where(moves, found / policy.truth_scale.clamp(min=1e-12), 0.0)
 
@@ -38,7 +40,10 @@ def report(policy: CNNPolicy, batch: Batch, names: tuple[str, ...]) -> None:
     """Print the median error of every predicted position [mm] and yaw [mrad]."""
     with torch.no_grad():
         found = torch.cat(
-            [read_off(policy, {k: v[i : i + 50] for k, v in batch.items()}) for i in range(0, FRAMES, 50)]
+            [
+                read_off(policy, {k: v[i : i + 50] for k, v in batch.items()})
+                for i in range(0, FRAMES, 50)
+            ]
         )
     truth, found = batch[ENVIRONMENT_STATE][: len(found)].double().numpy(), found.double().numpy()
     for name in names:
@@ -46,12 +51,16 @@ def report(policy: CNNPolicy, batch: Batch, names: tuple[str, ...]) -> None:
         if name.endswith(".x") and "axis" not in name:
             off = np.linalg.norm((found - truth)[:, first : first + 3], axis=1) * 1e3
             print(
-                f"{name.removesuffix('.x'):20} {np.median(off):6.1f} mm, nine of ten within {np.quantile(off, 0.9):.1f}"
+                f"{name.removesuffix('.x'):20} {np.median(off):6.1f} mm, nine of ten within"
+                f" {np.quantile(off, 0.9):.1f}"
             )
         if name.endswith(".cos4yaw"):
             yaw = [np.arctan2(one[:, first + 1], one[:, first]) / 4 for one in (found, truth)]
             off = np.abs((yaw[0] - yaw[1] + np.pi / 4) % (np.pi / 2) - np.pi / 4) * 1e3
-            print(f"{name:20} {np.median(off):6.1f} mrad, nine of ten within {np.quantile(off, 0.9):.1f}")
+            print(
+                f"{name:20} {np.median(off):6.1f} mrad, nine of ten within"
+                f" {np.quantile(off, 0.9):.1f}"
+            )
 
 
 def main() -> None:

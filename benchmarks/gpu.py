@@ -1,13 +1,15 @@
-"""Speed on a CUDA GPU: training from pictures against LeRobot's loader and loop, acting, and rendering by EGL.
+"""Speed on a CUDA GPU: training from pictures against LeRobot's loader and loop, acting, and
+rendering by EGL.
 
 python benchmarks/gpu.py
 
-Samples/s of ACT (two cameras of 96 x 96 and of 240 x 240 pixels; one of 480 x 640 for aloha, if gym_aloha is
-installed), diffusion and cnn (96 x 96), batches of 32, mixed precision if the policy supports it: for `manip_il`'s
-trainer, which decodes pictures once, and for LeRobot's DataLoader with one process per core (at most 8), its processors
-and updates as in `lerobot-train`. Both after a warm-up, alternating, on the same dataset of videos. Then milliseconds
-per action for 25 episodes in lockstep, on GPU and CPU, and pictures/s of the renderer.
-At most 8 minutes. Without a GPU it prints a message and exits with 0.
+Samples/s of ACT (two cameras of 96 x 96 and of 240 x 240 pixels; one of 480 x 640 for aloha, if
+gym_aloha is installed), diffusion and cnn (96 x 96), batches of 32, mixed precision if the policy
+supports it: for `manip_il`'s trainer, which decodes pictures once, and for LeRobot's DataLoader
+with one process per core (at most 8), its processors and updates as in `lerobot-train`. Both after
+a warm-up, alternating, on the same dataset of videos. Then milliseconds per action for 25 episodes
+in lockstep, on GPU and CPU, and pictures/s of the renderer. At most 8 minutes. Without a GPU it
+prints a message and exits with 0.
 """
 
 import os
@@ -46,8 +48,14 @@ BATCH, EPISODES_AT_ONCE = 32, 25
 SECONDS, REPEATS = 5.0, 3  # duration [s] and number of measurements
 LIMIT = 7 * 60  # [s] after which no further row is started
 ACT = {"type": "act", "use_amp": True, "pretrained_backbone_weights": None}
-DIFFUSION = {"type": "diffusion", "use_amp": True, "pretrained_backbone_weights": None, "crop_shape": [84, 84]}
-SIZES = {"small": (96, 96), "large": (240, 240), "aloha": (480, 640)}  # pictures of each dataset [pixels]
+DIFFUSION = {
+    "type": "diffusion",
+    "use_amp": True,
+    "pretrained_backbone_weights": None,
+    "crop_shape": [84, 84],
+}
+# pictures of each dataset [pixels]
+SIZES = {"small": (96, 96), "large": (240, 240), "aloha": (480, 640)}
 ALOHA = ["--robot.type=aloha", "--task.type=AlohaTransferCube-v0", "--cameras=top"]
 ROWS: dict[str, tuple[str, dict[str, Any]]] = {
     "act, 96 pixels": ("small", ACT),
@@ -60,12 +68,18 @@ ROWS: dict[str, tuple[str, dict[str, Any]]] = {
 
 def main() -> int:
     if not torch.cuda.is_available():
-        print("torch sees no CUDA card here: nothing to measure; see benchmarks/image_loading.py for a CPU")
+        print(
+            "torch sees no CUDA card here: nothing to measure; see benchmarks/image_loading.py for"
+            " a CPU"
+        )
         return 0
     datasets.disable_progress_bars()
     began = time.monotonic()
     print(f"{torch.cuda.get_device_name()}; {describe_machine()}")
-    print(f"training, batches of {BATCH}: samples/s   LeRobot's      ours   ratio (range)   ms an action: card, CPU")
+    print(
+        f"training, batches of {BATCH}: samples/s   LeRobot's      ours   ratio (range)   ms an"
+        " action: card, CPU"
+    )
     with tempfile.TemporaryDirectory() as folder:
         names = [name for name in SIZES if name != "aloha" or find_spec("gym_aloha")]
         roots = {name: record(Path(folder) / name, name) for name in names}
@@ -75,26 +89,44 @@ def main() -> int:
             if time.monotonic() - began > LIMIT:
                 break
             config = FitConfig(
-                {**options, "device": "cuda"}, observation="images", steps=10**6, batch_size=BATCH, log_freq=10**9
+                {**options, "device": "cuda"},
+                observation="images",
+                steps=10**6,
+                batch_size=BATCH,
+                log_freq=10**9,
             )
             trainer = Trainer((Dataset.open(roots[data]),), config, Path(folder) / name)
             steps = trainer.run(), lerobots_steps(roots[data], trainer)
-            pairs = [tuple(BATCH * per_s(partial(next, step)) for step in steps) for _ in range(REPEATS)]
+            pairs = [
+                tuple(BATCH * per_s(partial(next, step)) for step in steps) for _ in range(REPEATS)
+            ]
             trainer.save()
             saved = Path(folder) / name / "checkpoints/last/pretrained_model"
-            devices = ("cuda",) if options is DIFFUSION else ("cuda", "cpu")  # on a CPU a plan takes a minute
+            # on a CPU a plan takes a minute
+            devices = ("cuda",) if options is DIFFUSION else ("cuda", "cpu")
             times = [milliseconds_an_action(saved, device, SIZES[data]) for device in devices]
             print(row(name, pairs, times), flush=True)
         for size in (96, 240):
-            print(f"drawing, {size} x {size} pixels, {os.environ['MUJOCO_GL']}: {pictures_per_s(size):,.0f}/s")
+            print(
+                f"drawing, {size} x {size} pixels, {os.environ['MUJOCO_GL']}:"
+                f" {pictures_per_s(size):,.0f}/s"
+            )
     print(f"{time.monotonic() - began:.0f} s")
     return 0
 
 
 def record(root: Path, name: str) -> Path:
     height, width = SIZES[name]
-    words = ["record", f"--image.height={height}", f"--image.width={width}", f"--dataset.root={root}"]
-    words += ["--dataset.num_episodes=20", *(ALOHA if name == "aloha" else ["--cameras=front,wrist"])]
+    words = [
+        "record",
+        f"--image.height={height}",
+        f"--image.width={width}",
+        f"--dataset.root={root}",
+    ]
+    words += [
+        "--dataset.num_episodes=20",
+        *(ALOHA if name == "aloha" else ["--cameras=front,wrist"]),
+    ]
     command = "import sys; from manip_il.cli.main import main; sys.exit(main())"
     subprocess.run([sys.executable, "-c", command, *words], check=True, capture_output=True)
     return root
@@ -104,10 +136,18 @@ def lerobots_steps(root: Path, ours: Trainer) -> Iterator[None]:
     """Yield after each update as in lerobot-train, with the same options."""
     config: Any = ours.pipeline.policy
     meta: Any = LeRobotDataset("manip/benchmark", root=root).meta
-    dataset = LeRobotDataset("manip/benchmark", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
+    dataset = LeRobotDataset(
+        "manip/benchmark", root=root, delta_timestamps=resolve_delta_timestamps(config, meta)
+    )
     workers = min(8, len(os.sched_getaffinity(0)))
     loader = torch.utils.data.DataLoader(
-        dataset, BATCH, shuffle=True, drop_last=True, num_workers=workers, pin_memory=True, persistent_workers=True
+        dataset,
+        BATCH,
+        shuffle=True,
+        drop_last=True,
+        num_workers=workers,
+        pin_memory=True,
+        persistent_workers=True,
     )
     policy = make_policy(config, ds_meta=meta).train()
     before, _ = make_pre_post_processors(config, dataset_stats=meta.stats)
@@ -159,7 +199,10 @@ def row(name: str, pairs: list[tuple[float, ...]], times: list[float]) -> str:
     ours, theirs = (statistics.median(pair[way] for pair in pairs) for way in (0, 1))
     ratios = sorted(own / peer for own, peer in pairs)
     spread = f"{statistics.median(ratios):.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f})"
-    return f"{name:38} {theirs:12,.0f} {ours:9,.0f}   {spread:18} {', '.join(f'{one:.2f}' for one in times):>10}"
+    return (
+        f"{name:38} {theirs:12,.0f} {ours:9,.0f}   {spread:18}"
+        f" {', '.join(f'{one:.2f}' for one in times):>10}"
+    )
 
 
 if __name__ == "__main__":

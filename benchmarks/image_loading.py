@@ -1,13 +1,15 @@
-"""Samples per second for image training: decoded once and memory-mapped, against LeRobot's video DataLoader.
+"""Samples per second for image training: decoded once and memory-mapped, against LeRobot's video
+DataLoader.
 
 python benchmarks/image_loading.py [DATASET] [--quick]
 
-DATASET is the root of a dataset with cameras; without it one with two 128 x 128 cameras is recorded. Batches of 64 in
-shuffled order, all columns of the dataset, pictures as float32 in [0, 1]; ours on one thread, LeRobot's in this process
-and in two worker processes, of which the faster counts. All are warm: our frames are decoded, and every process has run
-an epoch. LeRobot's pictures are unchanged in both rows: augmentation is extra work of ours. The last line is the time
-to decode all frames once, in epochs of LeRobot's loader. All alternate in the same run; the result is the median ratio
-of the repeats.
+DATASET is the root of a dataset with cameras; without it one with two 128 x 128 cameras is
+recorded. Batches of 64 in shuffled order, all columns of the dataset, pictures as float32 in [0,
+1]; ours on one thread, LeRobot's in this process and in two worker processes, of which the faster
+counts. All are warm: our frames are decoded, and every process has run an epoch. LeRobot's pictures
+are unchanged in both rows: augmentation is extra work of ours. The last line is the time to decode
+all frames once, in epochs of LeRobot's loader. All alternate in the same run; the result is the
+median ratio of the repeats.
 """
 
 import argparse
@@ -48,9 +50,13 @@ class Repeat:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("dataset", type=Path, nargs="?")
-    parser.add_argument("--quick", action="store_true", help="few episodes, one repeat: shows that it runs")
+    parser.add_argument(
+        "--quick", action="store_true", help="few episodes, one repeat: shows that it runs"
+    )
     options = parser.parse_args()
     print(describe_machine())
     datasets.disable_progress_bars()
@@ -63,7 +69,12 @@ def main() -> int:
 
 
 def record(root: Path, episodes: int) -> Path:
-    words = ["record", "--cameras=front,wrist", f"--dataset.num_episodes={episodes}", f"--dataset.root={root}"]
+    words = [
+        "record",
+        "--cameras=front,wrist",
+        f"--dataset.num_episodes={episodes}",
+        f"--dataset.root={root}",
+    ]
     command = "import sys; from manip_il.cli.main import main; sys.exit(main())"
     subprocess.run([sys.executable, "-c", command, *words], check=True, capture_output=True)
     return root
@@ -75,7 +86,10 @@ def measure(root: Path, repeats: int) -> list[Repeat]:
     for peer in peers:
         next(peer)
     source = our_samples(root)
-    rows = {name: partial(our_epoch, source, augment, iter(range(10**9))) for name, augment in ROWS.items()}
+    rows = {
+        name: partial(our_epoch, source, augment, iter(range(10**9)))
+        for name, augment in ROWS.items()
+    }
     for epoch in rows.values():
         epoch()
     results: list[Repeat] = []
@@ -103,7 +117,11 @@ def our_samples(root: Path) -> Samples:
     table = {key: values for key, values in dataset.columns().items() if values.dtype != object}
     columns = {key: torch.from_numpy(np.array(values)) for key, values in table.items()}
     pictures = {camera: decode([dataset.camera(camera)]) for camera in dataset.cameras}
-    windows, tasks, rows = Windows(table["episode_index"], {}), [*dataset.tasks.values()], np.arange(len(dataset))
+    windows, tasks, rows = (
+        Windows(table["episode_index"], {}),
+        [*dataset.tasks.values()],
+        np.arange(len(dataset)),
+    )
     return Samples(windows, columns, pictures, np.array(tasks, object), rows, rows[:0])
 
 
@@ -138,7 +156,10 @@ def build_time(root: Path) -> float:
 
 def report(root: Path, repeats: list[Repeat]) -> None:
     keys, frames = Dataset.open(root).cameras, len(Dataset.open(root).columns(["index"])["index"])
-    print(f"{frames} frames of {len(keys)} cameras, batches of {BATCH}; samples/s, medians; ratios' medians and ranges")
+    print(
+        f"{frames} frames of {len(keys)} cameras, batches of {BATCH}; samples/s, medians; ratios'"
+        " medians and ranges"
+    )
     print("pictures    LeRobot, 0 processes   2 processes       ours   ours / LeRobot's best")
     two, none = (statistics.median(repeat.peers[way] for repeat in repeats) for way in (0, 1))
     for name in ROWS:
@@ -147,7 +168,10 @@ def report(root: Path, repeats: list[Repeat]) -> None:
         print(f"{name:10}  {none:20,.0f}  {two:12,.0f}  {ours:9,.0f}   {ratios}")
     build = statistics.median(repeat.build for repeat in repeats)
     share = summary([repeat.build * max(repeat.peers) / frames for repeat in repeats])
-    print(f"decoding once: {len(keys) * frames / build:,.0f} pictures/s; in epochs of LeRobot's best: {share}")
+    print(
+        f"decoding once: {len(keys) * frames / build:,.0f} pictures/s; in epochs of LeRobot's best:"
+        f" {share}"
+    )
 
 
 def summary(ratios: list[float]) -> str:

@@ -2,12 +2,13 @@
 
 python benchmarks/inverse.py [--seed N] [--demonstrations N] [--layouts N] [--robot R] [--quick]
 
-Records demonstrations of three tastes on the arm, learns weights from each with every method, and plans with them on
-unseen layouts. Prints by how much the plans' cost under the true weights exceeds that of the demonstrator's own plans,
-next to plans for length alone, and the time that learning took.
+Records demonstrations of three tastes on the arm, learns weights from each with every method, and
+plans with them on unseen layouts. Prints by how much the plans' cost under the true weights exceeds
+that of the demonstrator's own plans, next to plans for length alone, and the time that learning
+took.
 
-Limits: 3 % above for maximum entropy and Bayesian, 10 % for maximum margin; 60 s for maximum margin and maximum
-entropy, 300 s for Bayesian.
+Limits: 3 % above for maximum entropy and Bayesian, 10 % for maximum margin; 60 s for maximum margin
+and maximum entropy, 300 s for Bayesian.
 """
 
 import argparse
@@ -38,12 +39,16 @@ _LEAST = 1e-9  # weight of other features relative to that of length, to break t
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--robot", default="panda")
     parser.add_argument("--demonstrations", type=int, default=50)
     parser.add_argument("--layouts", type=int, default=100, help="unseen layouts to plan on")
-    parser.add_argument("--quick", action="store_true", help="a few of each: shows that it runs, measures nothing")
+    parser.add_argument(
+        "--quick", action="store_true", help="a few of each: shows that it runs, measures nothing"
+    )
     options = parser.parse_args()
     demonstrations, layouts = (4, 3) if options.quick else (options.demonstrations, options.layouts)
     print(describe_machine())
@@ -54,7 +59,11 @@ def main() -> int:
     for problem, start in unseen(options.robot, layouts, options.seed):
         for taste, found in learnt.items():
             truth = np.array(TASTES[taste].weights)
-            for name, weights in {"own": truth, "length": plain, **{m: w for m, (w, _) in found.items()}}.items():
+            for name, weights in {
+                "own": truth,
+                "length": plain,
+                **{m: w for m, (w, _) in found.items()},
+            }.items():
                 sums = cheapest_path(problem, plan(problem, weights), start)[1]
                 costs.setdefault((taste, name), []).append(float(sums @ truth))
     missed = _print(learnt, {key: float(np.mean(values)) for key, values in costs.items()})
@@ -62,7 +71,9 @@ def main() -> int:
 
 
 def unseen(robot: str, count: int, seed: int) -> Iterator[tuple[PathProblem, int]]:
-    """Yield the grids of layouts that are in no demonstration, and the node nearest to the object in each."""
+    """Yield the grids of layouts that are in no demonstration, and the node nearest to the
+    object in each.
+    """
     env = env_of(make_config(robot, CARRY))
     for one in stream_seeds("held_out", count, seed):
         env.reset(seed=one)
@@ -77,7 +88,11 @@ def _learn(robot: str, taste: str, count: int, seed: int) -> dict[str, tuple[F64
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / taste
         words = [f"--robot.type={robot}", f"--task.type={CARRY}:{taste}", f"--dataset.root={root}"]
-        more = [f"--dataset.repo_id=benchmark/{taste}", f"--dataset.num_episodes={count}", f"--seed={seed}"]
+        more = [
+            f"--dataset.repo_id=benchmark/{taste}",
+            f"--dataset.num_episodes={count}",
+            f"--seed={seed}",
+        ]
         if manip_il(["record", *words, *more, "--quiet"]):
             raise SystemExit("recording failed")
         shown = [one.demonstration for one in read_carried(root)]
@@ -89,7 +104,9 @@ def _learn(robot: str, taste: str, count: int, seed: int) -> dict[str, tuple[F64
     return found
 
 
-def _print(learnt: dict[str, dict[str, tuple[F64, float]]], costs: dict[tuple[str, str], float]) -> bool:
+def _print(
+    learnt: dict[str, dict[str, tuple[F64, float]]], costs: dict[tuple[str, str], float]
+) -> bool:
     """Print one line per taste and method; return whether a limit was missed."""
     missed = False
     for taste, found in learnt.items():
@@ -98,7 +115,9 @@ def _print(learnt: dict[str, dict[str, tuple[F64, float]]], costs: dict[tuple[st
         for method, (weights, seconds) in found.items():
             above = costs[taste, method] / own - 1
             missed |= above > ABOVE[method] or seconds > SECONDS[method]
-            print(f"{taste}, {method}: {above:.2%} above (limit {ABOVE[method]:.0%}), {seconds:.0f} s")
+            print(
+                f"{taste}, {method}: {above:.2%} above (limit {ABOVE[method]:.0%}), {seconds:.0f} s"
+            )
             print("   weights over length's: " + " ".join(f"{one:.2f}" for one in weights))
     return missed
 

@@ -1,9 +1,11 @@
-"""Time of one expert label relative to the bare quadratic program that it solves, and to a label of pick_place.
+"""Time of one expert label relative to the bare quadratic program that it solves, and to a label of
+pick_place.
 
 python benchmarks/label_speed.py [--quick]
 
-The states are from episodes driven by the expert and by random actions. The limit is daqp on the same problems, built
-beforehand; both alternate in the same run, state by state, and the tasks alternate, too.
+The states are from episodes driven by the expert and by random actions. The limit is daqp on the
+same problems, built beforehand; both alternate in the same run, state by state, and the tasks
+alternate, too.
 """
 
 import argparse
@@ -29,8 +31,12 @@ from manip_il.worlds.table import make_config
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few states: shows that it runs, measures little")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="few states: shows that it runs, measures little"
+    )
     options = parser.parse_args()
     episodes, repeats = (2, 2) if options.quick else (20, 5)
     print(describe_machine())
@@ -51,9 +57,14 @@ def compare_with_solver(episodes: int, repeats: int) -> None:
         for repeat in range(repeats):
             for i, (state, problem) in enumerate(pairs):
                 labels[repeat, i] = seconds(expert.label, state)
-                solves[repeat, i] = seconds(partial(qpsolvers.solve_problem, solver="daqp"), problem)
+                solves[repeat, i] = seconds(
+                    partial(qpsolvers.solve_problem, solver="daqp"), problem
+                )
         label, solve = np.median(labels.min(axis=0)), np.median(solves.min(axis=0))
-        print(f"{robot:5s}  {len(pairs):6d}  {1e6 * label:10.1f}  {1e6 * solve:12.1f}  {label / solve:10.2f}")
+        print(
+            f"{robot:5s}  {len(pairs):6d}  {1e6 * label:10.1f}  {1e6 * solve:12.1f} "
+            f" {label / solve:10.2f}"
+        )
 
 
 def compare_tasks(episodes: int, repeats: int) -> None:
@@ -73,18 +84,25 @@ def compare_tasks(episodes: int, repeats: int) -> None:
 
 
 def visited(robot: str, episodes: int, task: str = "pick_place") -> list[State]:
-    """Return states of `episodes` episodes driven by the expert, and of as many driven by random actions."""
+    """Return states of `episodes` episodes driven by the expert, and of as many driven by random
+    actions.
+    """
     states: list[State] = []
     horizon = {"expert": TASKS[task].horizon, "random": 50}
     for driver in ("expert", "random"):
-        job = RolloutJob(make_config(robot, task, horizon=horizon[driver]), driver_of(driver), hold=5)
+        job = RolloutJob(
+            make_config(robot, task, horizon=horizon[driver]), driver_of(driver), hold=5
+        )
         for episode in job.run(stream_seeds("certificate", episodes)):
             states += [State.from_vector(row) for row in episode.columns["sim_state"]]
     return states
 
 
 def problem_of(expert: Expert, state: State) -> qpsolvers.Problem | None:
-    """Return the quadratic program that a label solves, intercepted at the solver; None if it solves none."""
+    """Return the quadratic program that a label solves, intercepted at the solver.
+
+    None if it solves none.
+    """
     caught: list[qpsolvers.Problem] = []
     plain = ik.daqp.solve
 

@@ -1,11 +1,12 @@
-"""Simulated control steps per second of the whole reinforcement learning loop, as a share of what raw physics allows.
+"""Simulated control steps per second of the whole reinforcement learning loop, as a share of what
+raw physics allows.
 
 python benchmarks/learning_speed.py [--quick]
 
-Ours is GAIL's iteration with 16 environments: act, inverse kinematics, step, observe, discriminator, PPO, checkpoint.
-The limit is `mj_step` alone, replaying the same controls from the same starts. Both alternate iteration by iteration in
-the same run, in CPU seconds; the result is the median ratio. Also prints the share without the gradient steps of PPO
-and of the discriminator.
+Ours is GAIL's iteration with 16 environments: act, inverse kinematics, step, observe,
+discriminator, PPO, checkpoint. The limit is `mj_step` alone, replaying the same controls from the
+same starts. Both alternate iteration by iteration in the same run, in CPU seconds; the result is
+the median ratio. Also prints the share without the gradient steps of PPO and of the discriminator.
 """
 
 import argparse
@@ -51,8 +52,12 @@ class Recorded(RobotEpisode):
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few iterations: shows that it runs, measures little")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="few iterations: shows that it runs, measures little"
+    )
     iterations = 2 if parser.parse_args().quick else 8
     print(describe_machine())
     print("robot task        steps/s  raw physics, steps/s  share of raw  without gradient steps")
@@ -60,18 +65,30 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             measured = measure(robot, task, Path(folder), iterations)
         whole, acting, raw = np.median(measured, axis=0)
-        print(f"{robot:5s} {task:10s} {whole:8,.0f}  {raw:20,.0f}  {whole / raw:12.2f}  {acting / raw:22.2f}")
+        print(
+            f"{robot:5s} {task:10s} {whole:8,.0f}  {raw:20,.0f}  {whole / raw:12.2f} "
+            f" {acting / raw:22.2f}"
+        )
     return 0
 
 
-def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[float, float, float]]:
+def measure(
+    robot: str, task: str, folder: Path, iterations: int
+) -> list[tuple[float, float, float]]:
     """Return steps per second of every iteration: the whole loop, rollouts only, physics only."""
     demos = folder / "demos"
-    words = [f"--robot.type={robot}", f"--task.type={task}", "--dataset.num_episodes=5", f"--dataset.root={demos}"]
+    words = [
+        f"--robot.type={robot}",
+        f"--task.type={task}",
+        "--dataset.num_episodes=5",
+        f"--dataset.root={demos}",
+    ]
     if command(["record", *words, "--workers=1", "--quiet"]):
         raise SystemExit("recording failed")
     env = make_config(robot, task)
-    config = LearningConfig(method="gail", env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER)
+    config = LearningConfig(
+        method="gail", env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER
+    )
     run = LearningRun(config, folder, Engine())
     agent = run.agent()
     recorded = [Recorded(env, None) for _ in range(config.episodes)]

@@ -1,11 +1,13 @@
-"""Time to render one picture, against the unmodified physics model and against the scene without its robot.
+"""Time to render one picture, against the unmodified physics model and against the scene without
+its robot.
 
 python benchmarks/picture_speed.py [--quick]
 
-Ours is `manip_il.sim.render.pictures`, pose and antialiasing included. The peer is `mujoco.Renderer` on the simulated
-model, with its shadow map and OpenGL's antialiasing; the limit is `mujoco.Renderer` without the robot's meshes, without
-shadows and with one sample per pixel. All render the same states at the same size, alternating, with one OpenGL context
-at a time; the result is the median ratio over the repeats.
+Ours is `manip_il.sim.render.pictures`, pose and antialiasing included. The peer is
+`mujoco.Renderer` on the simulated model, with its shadow map and OpenGL's antialiasing; the limit
+is `mujoco.Renderer` without the robot's meshes, without shadows and with one sample per pixel. All
+render the same states at the same size, alternating, with one OpenGL context at a time; the result
+is the median ratio over the repeats.
 """
 
 import argparse
@@ -36,15 +38,21 @@ HIDDEN = 5  # a geom group that is not rendered
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument(
-        "--quick", action="store_true", help="one size, one repeat: shows that it runs, measures little"
+        "--quick",
+        action="store_true",
+        help="one size, one repeat: shows that it runs, measures little",
     )
     options = parser.parse_args()
     sizes, repeats = (SIZES[:1], 1) if options.quick else (SIZES, 5)
     print(describe_machine())
     print("medians and ranges of all repeats")
-    print("robot  camera  height x width  look     ours [ms]  as it is / ours       ours / no robot")
+    print(
+        "robot  camera  height x width  look     ours [ms]  as it is / ours       ours / no robot"
+    )
     for robot in ROBOTS:
         env = make_env(robot)
         states = visited(env)
@@ -54,15 +62,24 @@ def main() -> int:
                     config = CameraConfig((camera,), height, width, look)
                     row = [repeat(env, states, config) for _ in range(repeats)]
                     shown = f"{robot:5s}  {camera:6s}  {height:6d} x {width:<5d}  {name:7s}"
-                    print(f"{shown}  {statistics.median(one[0] for one in row) * 1e3:9.1f}  {summary(row)}", flush=True)
+                    print(
+                        f"{shown}  {statistics.median(one[0] for one in row) * 1e3:9.1f} "
+                        f" {summary(row)}",
+                        flush=True,
+                    )
     return 0
 
 
 def summary(row: list[tuple[float, float, float]]) -> str:
     """Return the two ratios, each with its range."""
     texts: list[str] = []
-    for ratios in ([as_it_is / ours for ours, as_it_is, _ in row], [ours / no_robot for ours, _, no_robot in row]):
-        texts.append(f"{statistics.median(ratios):4.1f} ({min(ratios):.1f} to {max(ratios):.1f})".ljust(20))
+    for ratios in (
+        [as_it_is / ours for ours, as_it_is, _ in row],
+        [ours / no_robot for ours, _, no_robot in row],
+    ):
+        texts.append(
+            f"{statistics.median(ratios):4.1f} ({min(ratios):.1f} to {max(ratios):.1f})".ljust(20)
+        )
     return "  ".join(texts).rstrip()
 
 
@@ -78,7 +95,9 @@ def visited(env: ManipEnv) -> list[State]:
 
 
 def repeat(env: ManipEnv, states: list[State], config: CameraConfig) -> tuple[float, float, float]:
-    """Return seconds per picture: ours, the unmodified physics model, the scene without its robot."""
+    """Return seconds per picture: ours, the unmodified physics model, the scene without its
+    robot.
+    """
     import mujoco  # after our import, which chooses the OpenGL backend
 
     ours = seconds(env, states, lambda: render.pictures(env.scene, env.data, config))

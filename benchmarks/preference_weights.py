@@ -1,16 +1,19 @@
-"""A reward from 200 answers, and the gain from weighting frames by it if half of the episodes are a bad policy's.
+"""A reward from 200 answers, and the gain from weighting frames by it if half of the episodes are a
+bad policy's.
 
 python benchmarks/preference_weights.py [--task NAME] [--output DIR] [--quick]
 
-Runs DAgger for policies of varying quality, asks a teacher who errs in a tenth of the answers about 100 pairs of their
-clips, learns a reward, asks about 100 more on which its networks disagree, and relearns the reward from all 200.
-Measures its agreement with true progress on 2,000 pairs without answers, for five draws of pairs and errors. Then joins
-100 demonstrations with 100 episodes of round 0's policy, both with the executed actions as labels, scores the
-episodes with the first draw's reward, and clones the joined data unweighted, weighted, and the demonstrations alone.
-Prints agreement, the area under the ROC curve for failed episodes beside that of true progress, and the clones' success
-on the same unseen seeds.
+Runs DAgger for policies of varying quality, asks a teacher who errs in a tenth of the answers about
+100 pairs of their clips, learns a reward, asks about 100 more on which its networks disagree, and
+relearns the reward from all 200. Measures its agreement with true progress on 2,000 pairs without
+answers, for five draws of pairs and errors. Then joins 100 demonstrations with 100 episodes of
+round 0's policy, both with the executed actions as labels, scores the episodes with the first
+draw's reward, and clones the joined data unweighted, weighted, and the demonstrations alone. Prints
+agreement, the area under the ROC curve for failed episodes beside that of true progress, and the
+clones' success on the same unseen seeds.
 
-Limits: mean agreement at least 90 %, area at least 0.95, weighted ahead by at least 15 points with p < 0.001.
+Limits: mean agreement at least 90 %, area at least 0.95, weighted ahead by at least 15 points with
+p < 0.001.
 """
 
 import argparse
@@ -42,10 +45,16 @@ _FRESH, _CLIP, _DRAWS = 2_000, 20, 5
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--task", default="pick_place")
-    parser.add_argument("--output", type=Path, help="folder for all results; by default a temporary one")
-    parser.add_argument("--quick", action="store_true", help="a few of each: shows that it runs, measures nothing")
+    parser.add_argument(
+        "--output", type=Path, help="folder for all results; by default a temporary one"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="a few of each: shows that it runs, measures nothing"
+    )
     options = parser.parse_args()
     print(describe_machine())
     with tempfile.TemporaryDirectory() as folder:
@@ -56,23 +65,46 @@ def measure(folder: Path, task: str, *, quick: bool) -> int:
     """Create everything in a folder; return 1 if a limit is missed."""
     few, episodes, steps, seeds = (2, 2, 20, 4) if quick else (30, 100, 2_000, 500)
     rounds, half = folder / "rounds", folder / "half"
-    sizes = f"--demonstrations={few} --rounds={1 if quick else 5} --episodes_per_round={2 if quick else 40}"
-    run(f"dagger --task.type={task} {sizes} --steps={steps} --validation_episodes={few} --seed=11", rounds)
-    rewards = [learn_reward(rounds, folder, draw, 12 if quick else 100) for draw in range(1 if quick else _DRAWS)]
-    agreements = [fresh_agreement(rounds, reward, 20 if quick else _FRESH) for reward in rewards]
-    good = f"record --robot.type=panda --task.type={task} --dataset.num_episodes={episodes} --dataset.repo_id=a/good"
-    manip(f"{good} --dataset.root={folder / 'good'} --seed=21")
-    poor = f"--policy.path={rounds / 'round_000' / 'policy'} --rounds=1 --episodes_per_round={episodes}"
+    sizes = (
+        f"--demonstrations={few} --rounds={1 if quick else 5}"
+        f" --episodes_per_round={2 if quick else 40}"
+    )
     run(
-        f"dagger --task.type={task} {poor} --disturbed_share=0 --steps=1 --validation_episodes=1 --seed=22",
+        f"dagger --task.type={task} {sizes} --steps={steps} --validation_episodes={few} --seed=11",
+        rounds,
+    )
+    rewards = [
+        learn_reward(rounds, folder, draw, 12 if quick else 100)
+        for draw in range(1 if quick else _DRAWS)
+    ]
+    agreements = [fresh_agreement(rounds, reward, 20 if quick else _FRESH) for reward in rewards]
+    good = (
+        f"record --robot.type=panda --task.type={task} --dataset.num_episodes={episodes}"
+        " --dataset.repo_id=a/good"
+    )
+    manip(f"{good} --dataset.root={folder / 'good'} --seed=21")
+    poor = (
+        f"--policy.path={rounds / 'round_000' / 'policy'} --rounds=1"
+        f" --episodes_per_round={episodes}"
+    )
+    run(
+        f"dagger --task.type={task} {poor} --disturbed_share=0 --steps=1 --validation_episodes=1"
+        " --seed=22",
         folder / "bad",
     )
     join(folder / "good", folder / "bad" / "round_001" / "dataset", half)
     run(f"data score {half} --reward={rewards[0]}", folder / "scores")
     run(f"data score {half} --reward=progress", folder / "true_scores")
-    area, true = (json.loads((folder / name / "scores.json").read_text())["auc"] for name in ("scores", "true_scores"))
+    area, true = (
+        json.loads((folder / name / "scores.json").read_text())["auc"]
+        for name in ("scores", "true_scores")
+    )
     weights = f"--weights={folder / 'scores' / 'rabc.parquet'}"
-    sources = {"weighted": f"{half} {weights}", "as it is": half, "demonstrations alone": folder / "good"}
+    sources = {
+        "weighted": f"{half} {weights}",
+        "as it is": half,
+        "demonstrations alone": folder / "good",
+    }
     results = {name: clone(folder, name, source, steps, seeds) for name, source in sources.items()}
     compared = Comparison(*(Side.of(name, results[name]) for name in ("as it is", "weighted")))
     agreement = float(np.mean([one.rate for one in agreements]))
@@ -90,15 +122,23 @@ def measure(folder: Path, task: str, *, quick: bool) -> int:
 
 
 def learn_reward(rounds: Path, folder: Path, draw: int, count: int) -> Path:
-    """Learn a reward from `count` answers, and again with as many more on pairs on which its networks disagree."""
+    """Learn a reward from `count` answers, and again with as many more on pairs on which its
+    networks disagree.
+    """
     made = folder / f"draw_{draw}"
     made.mkdir(parents=True, exist_ok=True)
     first, reward = made / "first", made / "reward"
     files: list[Path] = []
     for name, by, seed in (("even", "", draw), ("asked", f"--reward={first}", draw + 500)):
         pairs, answers = made / f"{name}_pairs.json", made / f"{name}.json"
-        manip(f"reward pairs {rounds} --clip={_CLIP} --count={count} {by} --seed={seed} --output={pairs}")
-        manip(f"reward answer {pairs} --sources={rounds} --teacher=mistaken:0.1 --seed={seed} --output={answers}")
+        manip(
+            f"reward pairs {rounds} --clip={_CLIP} --count={count} {by} --seed={seed}"
+            f" --output={pairs}"
+        )
+        manip(
+            f"reward answer {pairs} --sources={rounds} --teacher=mistaken:0.1 --seed={seed}"
+            f" --output={answers}"
+        )
         files.append(answers)
         given = f"{made / 'even_pairs.json'} {' '.join(map(str, files))}"
         more = f"--more_pairs={pairs}" if by else ""
@@ -107,7 +147,9 @@ def learn_reward(rounds: Path, folder: Path, draw: int, count: int) -> Path:
 
 
 def clone(folder: Path, name: str, source: object, steps: int, seeds: int) -> EvalResult:
-    """Clone a dataset and evaluate the clone on unseen seeds. source: the dataset's folder, with `--weights` if any."""
+    """Clone a dataset and evaluate the clone on unseen seeds. source: the dataset's folder, with
+    `--weights` if any.
+    """
     word = name.replace(" ", "_")
     run(f"train --dataset.root={source} --steps={steps}", folder / word)
     run(f"eval --policy.path={folder / word} --eval.n_episodes={seeds}", folder / f"eval_{word}")
@@ -115,7 +157,9 @@ def clone(folder: Path, name: str, source: object, steps: int, seeds: int) -> Ev
 
 
 def fresh_agreement(rounds: Path, reward: Path, count: int) -> Proportion:
-    """Return the share of new pairs of clips, without ties, on which the reward agrees with true progress."""
+    """Return the share of new pairs of clips, without ties, on which the reward agrees with true
+    progress.
+    """
     clips = choose_pairs(find_datasets([rounds]), _CLIP, count, 0, np.random.default_rng(999))
     returns = LearnedReward.load(reward / PRETRAINED_MODEL)(clips.inputs)[clips.rows].sum(-1)
     difference = true_difference(clips)
@@ -125,12 +169,19 @@ def fresh_agreement(rounds: Path, reward: Path, count: int) -> Proportion:
 
 
 def join(good: Path, bad: Path, target: Path) -> None:
-    """Write the episodes of two datasets as one, labelled with the executed actions, the only ones a recorder knows."""
-    datasets, made = [*map(Dataset.open, (good, bad))], [target.with_name(name) for name in ("half_good", "half_bad")]
+    """Write the episodes of two datasets as one, labelled with the executed actions, the only
+    ones a recorder knows.
+    """
+    datasets, made = (
+        [*map(Dataset.open, (good, bad))],
+        [target.with_name(name) for name in ("half_good", "half_bad")],
+    )
     for dataset, part in zip(datasets, made, strict=True):
         own = Own(dataset.spec, dataset.fingerprint, dataset.provenance)
         episodes = map(as_recorded, dataset.stored_episodes())
-        write_episodes(episodes, part, dataset.stored_features, dataset.fps, dataset.info.robot, own)
+        write_episodes(
+            episodes, part, dataset.stored_features, dataset.fps, dataset.info.robot, own
+        )
     first, second = (dataset.info.episodes for dataset in datasets)
     count = min(first, second)
     merge_datasets(made, target, [f"0:{count}", f"{first}:{first + count}"])

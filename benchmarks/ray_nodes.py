@@ -1,10 +1,11 @@
-"""Recording on four local Ray nodes of one core each, against one such node and against two processes.
+"""Recording on four local Ray nodes of one core each, against one such node and against two
+processes.
 
 python benchmarks/ray_nodes.py [--quick]
 
-All record journals of the same episodes, alternating, with warm workers; medians over the turns, with their range.
-"four nodes / two processes" is the overhead of Ray, as both share the same cores. "over the wire" is the packed size of
-an episode that a worker sends back.
+All record journals of the same episodes, alternating, with warm workers; medians over the turns,
+with their range. "four nodes / two processes" is the overhead of Ray, as both share the same cores.
+"over the wire" is the packed size of an episode that a worker sends back.
 """
 
 import argparse
@@ -33,14 +34,20 @@ TURNS = 5
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few episodes: shows that it runs, measures little")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="few episodes: shows that it runs, measures little"
+    )
     quick = parser.parse_args().quick
     episodes, turns = (4, 1) if quick else (60, TURNS)
     job = RolloutJob(make_config("panda"))
     print(describe_machine())
     print(f"over the wire: {wire(job):,.0f} bytes an episode of panda pick_place")
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    cluster = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
+    )
     for _ in range(1, NODES):
         cluster.add_node(num_cpus=1)
     cluster.wait_for_nodes()
@@ -48,14 +55,22 @@ def main() -> int:
         ray.init(address=cluster.address, log_to_driver=False, logging_level=logging.ERROR)
         with Engine(None, "ray") as four, Engine(1, "ray") as one, Engine(2) as local:
             ways = {"two processes": local, "four nodes": four, "one node": one}
-            times = measured({name: recorder(engine, job) for name, engine in ways.items()}, episodes, turns)
+            times = measured(
+                {name: recorder(engine, job) for name, engine in ways.items()}, episodes, turns
+            )
     finally:
         ray.shutdown()
         cluster.shutdown()
     for name, seconds in times.items():
         print(f"{name:14s} {episodes / statistics.median(seconds):7.2f} episodes/s")
-    print("four nodes / two processes, time an episode:", spread(times["four nodes"], times["two processes"]))
-    print("one node / four nodes, time an episode:     ", spread(times["one node"], times["four nodes"]))
+    print(
+        "four nodes / two processes, time an episode:",
+        spread(times["four nodes"], times["two processes"]),
+    )
+    print(
+        "one node / four nodes, time an episode:     ",
+        spread(times["one node"], times["four nodes"]),
+    )
     return 0
 
 
@@ -73,7 +88,9 @@ def recorder(engine: Engine, job: RolloutJob) -> Callable[[int], float]:
     return record
 
 
-def measured(ways: dict[str, Callable[[int], float]], episodes: int, turns: int) -> dict[str, list[float]]:
+def measured(
+    ways: dict[str, Callable[[int], float]], episodes: int, turns: int
+) -> dict[str, list[float]]:
     for record in ways.values():
         record(2 * NODES)  # starts the workers, which import and compile
     times: dict[str, list[float]] = {name: [] for name in ways}

@@ -1,12 +1,14 @@
-"""Recording end to end (simulate, label, journal, dataset) against the cost of its parts alone, in the same run.
+"""Recording end to end (simulate, label, journal, dataset) against the cost of its parts alone, in
+the same run.
 
 python benchmarks/recording_speed.py [--quick]
 
-One core: this process is pinned to one core, including the threads that encode video. The limit is `mj_step` replaying
-the recorded controls from the same starts, plus, with cameras, rendering the same pictures; episodes alternate.
-"encoding beside it": video is encoded on a second core, as in `record`; recordings and their limits alternate.
-Two workers: the same recording with two processes against one, all warm, and bare physics with two processes against
-one, which is the machine's limit. The result is the median ratio over the repeats.
+One core: this process is pinned to one core, including the threads that encode video. The limit is
+`mj_step` replaying the recorded controls from the same starts, plus, with cameras, rendering the
+same pictures; episodes alternate. "encoding beside it": video is encoded on a second core, as in
+`record`; recordings and their limits alternate. Two workers: the same recording with two processes
+against one, all warm, and bare physics with two processes against one, which is the machine's
+limit. The result is the median ratio over the repeats.
 """
 
 import argparse
@@ -26,7 +28,8 @@ from _machine import describe_machine
 from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import make_config
 
-os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa renders on the calling core, here and in the limit
+# Mesa renders on the calling core, here and in the limit
+os.environ.setdefault("LP_NUM_THREADS", "0")
 
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import collect, provenance
@@ -45,17 +48,26 @@ BARE_STEPS = 50_000  # steps of bare physics, to measure the gain from a second 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few episodes: shows that it runs, measures little")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="few episodes: shows that it runs, measures little"
+    )
     quick = parser.parse_args().quick
     print(describe_machine())
-    print("recording                       control steps/s  limit, control steps/s  share (median, all repeats)")
+    print(
+        "recording                       control steps/s  limit, control steps/s  share (median,"
+        " all repeats)"
+    )
     for robot in ROBOTS:
         job = RolloutJob(make_config(robot), hold=HOLD)
         report(f"{robot}, one core", *one_core(job, 2 if quick else 40, 2 if quick else 5))
     for robot in ROBOTS:
         job = RolloutJob(make_config(robot), hold=HOLD, cameras=CAMERAS)
-        report(f"{robot}, two cameras, one core", *one_core(job, 1 if quick else 8, 2 if quick else 3))
+        report(
+            f"{robot}, two cameras, one core", *one_core(job, 1 if quick else 8, 2 if quick else 3)
+        )
         report(f"{robot}, encoding beside it", *beside(job, 1 if quick else 8, 2 if quick else 3))
     print("two workers against one       recording              bare physics: the machine's limit")
     for robot in ROBOTS:
@@ -75,23 +87,30 @@ def one_core(job: RolloutJob, episodes: int, repeats: int) -> tuple[list[float],
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(cores)})
     try:
-        measured = [steps_per_second(job, episodes) for _ in range(repeats + 1)][1:]  # the first one loads and compiles
+        # the first one loads and compiles
+        measured = [steps_per_second(job, episodes) for _ in range(repeats + 1)][1:]
     finally:
         os.sched_setaffinity(0, cores)
     return [ours for ours, _ in measured], [limit for _, limit in measured]
 
 
 def beside(job: RolloutJob, episodes: int, repeats: int) -> tuple[list[float], list[float]]:
-    """Return control steps per second if video may be encoded on another core than simulation and rendering."""
+    """Return control steps per second if video may be encoded on another core than simulation
+    and rendering.
+    """
     ours: list[float] = []
     limits: list[float] = []
     for repeat in range(-1, repeats):
         with tempfile.TemporaryDirectory() as folder:
             root = Path(folder) / "demos"
             seconds = record_seconds(Engine(), job, stream_seeds("certificate", episodes), root)
-            recorded = [read_journal(path)[1] for path in list_episodes(root.with_name("demos.journals"))]
+            recorded = [
+                read_journal(path)[1] for path in list_episodes(root.with_name("demos.journals"))
+            ]
         frames = sum(len(episode) for episode in recorded)
-        limit = sum(replay_seconds(job, one.seed, one.columns["executed_action"]) for one in recorded)
+        limit = sum(
+            replay_seconds(job, one.seed, one.columns["executed_action"]) for one in recorded
+        )
         if repeat >= 0:
             ours.append(frames / seconds)
             limits.append(frames / limit)
@@ -99,7 +118,9 @@ def beside(job: RolloutJob, episodes: int, repeats: int) -> tuple[list[float], l
 
 
 def steps_per_second(job: RolloutJob, episodes: int) -> tuple[float, float]:
-    """Return control steps per second of recording, and of its limit, measured after every episode."""
+    """Return control steps per second of recording, and of its limit, measured after every
+    episode.
+    """
     limit = 0.0
     frames = 0
 
@@ -110,14 +131,22 @@ def steps_per_second(job: RolloutJob, episodes: int) -> tuple[float, float]:
         limit += replay_seconds(job, episode.seed, episode.columns["executed_action"])
 
     with tempfile.TemporaryDirectory() as folder:
-        seconds = record_seconds(Engine(), job, stream_seeds("certificate", episodes), Path(folder) / "demos", replay)
+        seconds = record_seconds(
+            Engine(), job, stream_seeds("certificate", episodes), Path(folder) / "demos", replay
+        )
     return frames / seconds, frames / limit
 
 
 def record_seconds(
-    engine: Engine, job: RolloutJob, seeds: range, root: Path, between: Callable[[Path], None] | None = None
+    engine: Engine,
+    job: RolloutJob,
+    seeds: range,
+    root: Path,
+    between: Callable[[Path], None] | None = None,
 ) -> float:
-    """Return the seconds of `manip-il record`'s code path. between: called after every episode, not timed."""
+    """Return the seconds of `manip-il record`'s code path. between: called after every episode,
+    not timed.
+    """
     journals = root.with_name(f"{root.name}.journals")
     paused = 0.0
     started = time.perf_counter()
@@ -136,14 +165,18 @@ def record_seconds(
 
 
 def replay_seconds(job: RolloutJob, seed: int, actions: np.ndarray) -> float:
-    """Return the seconds of an episode's bare physics, and of rendering its pictures if the job has cameras."""
+    """Return the seconds of an episode's bare physics, and of rendering its pictures if the job
+    has cameras.
+    """
     import mujoco  # after our import, which chooses the OpenGL backend
 
     env = env_of(job.env)
     env.start(seed)
     model, data, physics_steps = env.scene.model, env.data, job.env.physics_steps
     space, gripper = env.scene.actions, env.scene.gripper
-    commands = [np.append(arm, gripper.command(opening)) for arm, opening in map(space.split, actions)]
+    commands = [
+        np.append(arm, gripper.command(opening)) for arm, opening in map(space.split, actions)
+    ]
     controls, order = np.array(commands), [*env.scene.arm_ctrl, *gripper.ctrl]
     if job.cameras is not None:
         pictures(env.scene, data, job.cameras)  # the first call creates the context

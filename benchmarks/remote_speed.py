@@ -1,14 +1,16 @@
-"""Push and pull over loopback against copying with the plain client: 1,000 small files, and one large one.
+"""Push and pull over loopback against copying with the plain client: 1,000 small files, and one
+large one.
 
 python benchmarks/remote_speed.py [--quick] [--repeats N] [--stores file,sftp,hub,s3]
 
-Ours hashes, verifies and commits atomically; the plain client only copies: shutil.copytree for file://;
-paramiko's put and get for sftp:// (Debian's sshd, which must be installed); huggingface_hub's upload_folder and
-snapshot_download for hf:// (the tests' server); s3fs' put and get for s3:// (moto, in a process of its own).
-Both alternate in the same run, into new places each time; the result is the median ratio (above 1: ours is faster).
+Ours hashes, verifies and commits atomically; the plain client only copies: shutil.copytree for
+file://; paramiko's put and get for sftp:// (Debian's sshd, which must be installed);
+huggingface_hub's upload_folder and snapshot_download for hf:// (the tests' server); s3fs' put and
+get for s3:// (moto, in a process of its own). Both alternate in the same run, into new places each
+time; the result is the median ratio (above 1: ours is faster).
 
-ratio: of the commands' times; our pull ends when all data are on disk, the plain client's when they are in memory.
-on disk: of the times until all data are on this machine's disk.
+ratio: of the commands' times; our pull ends when all data are on disk, the plain client's when they
+are in memory. on disk: of the times until all data are on this machine's disk.
 """
 
 import argparse
@@ -41,7 +43,10 @@ BUCKET = "benchmark"
 
 @dataclass(frozen=True)
 class Store:
-    """A kind of store and its plain client. put: copies a folder to a place in the store; get: copies it back."""
+    """A kind of store and its plain client. put: copies a folder to a place in the store.
+
+    get: copies it back.
+    """
 
     name: str
     url: Callable[[str], str]
@@ -50,7 +55,9 @@ class Store:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="a tenth of everything, once")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--stores", default="file,sftp,hub,s3")
@@ -67,8 +74,12 @@ def main() -> int:
         hub = stack.enter_context(hub_server())
         warm = make_tree(folder / "warm", 10, 10_000, "json")
         trees = {
-            f"{1000 // tenth:,} of 10 kB": make_tree(folder / "small", 1000 // tenth, 10_000, "json"),
-            f"1 of {1000 // tenth} MB": make_tree(folder / "large", 1, 10**9 // tenth, "safetensors"),
+            f"{1000 // tenth:,} of 10 kB": make_tree(
+                folder / "small", 1000 // tenth, 10_000, "json"
+            ),
+            f"1 of {1000 // tenth} MB": make_tree(
+                folder / "large", 1, 10**9 // tenth, "safetensors"
+            ),
         }
         for store in stores(server, hub):
             if store.name not in options.stores.split(","):
@@ -76,7 +87,10 @@ def main() -> int:
             turn(store, warm, folder / f"{store.name}_warm")
             for number, (name, tree) in enumerate(trees.items()):
                 places = [folder / f"{store.name}_{number}_{repeat}" for repeat in range(repeats)]
-                turns = [turn(store, tree, place, ours_first=bool(n % 2)) for n, place in enumerate(places)]
+                turns = [
+                    turn(store, tree, place, ours_first=bool(n % 2))
+                    for n, place in enumerate(places)
+                ]
                 show(f"{store.name:9} {name:16}", turns)
     return 0
 
@@ -112,7 +126,9 @@ def show(row: str, turns: list[dict[str, float]]) -> None:
         for name in (f"plain {what}", what):
             row += f" {statistics.median(times[name] for times in turns):10.2f}"
         for end in ("", " on disk"):
-            ratio = statistics.median(times[f"plain {what}{end}"] / times[f"{what}{end}"] for times in turns)
+            ratio = statistics.median(
+                times[f"plain {what}{end}"] / times[f"{what}{end}"] for times in turns
+            )
             row += f" {ratio:7.2f}"
         row += "   "
     print(row, flush=True)
@@ -120,7 +136,10 @@ def show(row: str, turns: list[dict[str, float]]) -> None:
 
 @contextlib.contextmanager
 def moto_beside() -> Iterator[dict[str, str]]:
-    """Yield the variables of a server in another process; in this one it would compete for Python's global lock."""
+    """Yield the variables of a server in another process.
+
+    In this one it would compete for Python's global lock.
+    """
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     server = context.Process(target=_serve_s3, args=(there,))
@@ -195,7 +214,8 @@ def make_tree(folder: Path, files: int, size: int, suffix: str) -> Path:
     """Create and return a folder that `push` takes for a run. size: of each file [bytes]."""
     _made(folder)
     (folder / "config.yaml").write_text("# manip-il\n")
-    (folder / "README.md").write_text("---\nlicense: mit\n---\n")  # its own card, so that none is generated
+    # its own card, so that none is generated
+    (folder / "README.md").write_text("---\nlicense: mit\n---\n")
     for number in range(files):
         (folder / f"{number}.{suffix}").write_bytes(os.urandom(size))
     return folder

@@ -1,12 +1,15 @@
-"""A learnt reward against cloning on the same demonstrations, and on arms without any demonstrations.
+"""A learnt reward against cloning on the same demonstrations, and on arms without any
+demonstrations.
 
-python benchmarks/reward_transfer.py [--taste NAME] [--demonstrations N] [--layouts N] [--steps N] [--quick]
+python benchmarks/reward_transfer.py [--taste NAME] [--demonstrations N] [--layouts N] [--steps N]
+[--quick]
 
-Records demonstrations of `carry` on the Panda on layouts with at most two things, learns the reward from them with
-every method, and clones them. Then drives on unseen layouts, with three or four things on the Panda and any number on
-the other arms, and sums the cost of the object's path under the true weights. An episode that does not reach the goal
-is worse than any that does. Prints one line per driver: episodes that reached the goal, mean cost above that of a
-driver with the true weights on the same layouts, and on the Panda how often it is cheaper than the clone (sign test).
+Records demonstrations of `carry` on the Panda on layouts with at most two things, learns the reward
+from them with every method, and clones them. Then drives on unseen layouts, with three or four
+things on the Panda and any number on the other arms, and sums the cost of the object's path under
+the true weights. An episode that does not reach the goal is worse than any that does. Prints one
+line per driver: episodes that reached the goal, mean cost above that of a driver with the true
+weights on the same layouts, and on the Panda how often it is cheaper than the clone (sign test).
 
 Limits: at most 5 % above on every arm; cheaper than the clone with p < 0.01.
 """
@@ -54,20 +57,31 @@ class Driven:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--taste", default="careful", choices=list(TASTES))
     parser.add_argument("--demonstrations", type=int, default=50)
     parser.add_argument("--layouts", type=int, default=100)
     parser.add_argument("--steps", type=int, default=10_000, help="gradient steps of the clone")
-    parser.add_argument("--quick", action="store_true", help="a few of each: shows that it runs, measures nothing")
+    parser.add_argument(
+        "--quick", action="store_true", help="a few of each: shows that it runs, measures nothing"
+    )
     options = parser.parse_args()
-    count, layouts, steps = (3, 2, 20) if options.quick else (options.demonstrations, options.layouts, options.steps)
+    count, layouts, steps = (
+        (3, 2, 20) if options.quick else (options.demonstrations, options.layouts, options.steps)
+    )
     print(describe_machine())
     truth, missed = TASTES[options.taste], False
     with tempfile.TemporaryDirectory() as folder:
         root = demonstrate(Path(folder), options.taste, count)
         rewards = learnt(root)
-        words = [f"--dataset.root={root}", f"--steps={steps}", f"--output_dir={folder}/clone", "--quiet"]
+        words = [
+            f"--dataset.root={root}",
+            f"--steps={steps}",
+            f"--output_dir={folder}/clone",
+            "--quiet",
+        ]
         if manip_il(["train", *words]):
             raise SystemExit("the clone could not be fitted")
         clone = Path(folder) / "clone" / "checkpoints" / "last" / "pretrained_model"
@@ -91,16 +105,23 @@ def demonstrate(folder: Path, taste: str, count: int) -> Path:
     """Record `count` episodes on layouts with few things; return their dataset."""
     root, kept = folder / "all", folder / "few.journals"
     words = [f"--task.type={CARRY}:{taste}", f"--dataset.root={root}", "--quiet"]
-    if manip_il(["record", *words, "--dataset.repo_id=benchmark/all", f"--dataset.num_episodes={3 * count}"]):
+    if manip_il(
+        ["record", *words, "--dataset.repo_id=benchmark/all", f"--dataset.num_episodes={3 * count}"]
+    ):
         raise SystemExit("recording failed")
     names = Dataset.open(root).spec.environment_state_names
     journals = root.with_name("all.journals")
-    few = [path for path in list_episodes(journals) if things(read_journal(path)[1], names) <= FEW][:count]
+    few = [path for path in list_episodes(journals) if things(read_journal(path)[1], names) <= FEW][
+        :count
+    ]
     kept.mkdir()
     for path in few:
         shutil.copy(path, kept)
     if len(few) < count or manip_il(["data", "build", str(kept), str(folder / "few")]):
-        raise SystemExit(f"only {len(few)} of {3 * count} layouts have at most {FEW} things, or no dataset was built")
+        raise SystemExit(
+            f"only {len(few)} of {3 * count} layouts have at most {FEW} things, or no dataset was"
+            " built"
+        )
     return folder / "few"
 
 
@@ -118,7 +139,9 @@ def things(episode: Episode, names: Sequence[str]) -> int:
 
 
 def drive(job: RolloutJob, truth: Reward, layouts: int, *, many: bool) -> list[Driven]:
-    """Return the costs of a job's first `layouts` unseen episodes. many: with more things than were demonstrated."""
+    """Return the costs of a job's first `layouts` unseen episodes. many: with more things than
+    were demonstrated.
+    """
     names = env_spec(job.env).environment_state_names
     found: list[Driven] = []
     for seed in _seeds(job.env, layouts, many=many):
@@ -128,7 +151,9 @@ def drive(job: RolloutJob, truth: Reward, layouts: int, *, many: bool) -> list[D
 
 
 def _seeds(env: EnvConfig, layouts: int, *, many: bool) -> Iterator[int]:
-    """Yield seeds of layouts that are in no demonstration, identified by their first observation."""
+    """Yield seeds of layouts that are in no demonstration, identified by their first
+    observation.
+    """
     simulated, left = env_of(env), layouts
     names = env_spec(env).environment_state_names
     here = [names.index(f"{name}.here") for name in (*OBSTACLES, EDGE)]
@@ -149,11 +174,15 @@ def _cost(env: EnvConfig, episode: Episode, names: Sequence[str], truth: Reward)
     scene = scene_of(env.robot, CARRY, env.object)
     layout = observed_layout(scene, OBJECT, dict(zip(names, seen[0].tolist(), strict=True)))
     at = seen[:, [names.index(f"{OBJECT}.{axis}") for axis in "xyz"]]
-    return float(path_features(layout, carried_stretch(at, np.array(layout.goal))) @ np.array(truth.weights))
+    return float(
+        path_features(layout, carried_stretch(at, np.array(layout.goal))) @ np.array(truth.weights)
+    )
 
 
 def path_features(layout: Layout, positions: F64) -> F64:
-    """Return the features of a path of the object's centre, (T, 3) [m], as line integrals along it, (K,)."""
+    """Return the features of a path of the object's centre, (T, 3) [m], as line integrals along
+    it, (K,).
+    """
     pieces, steps = 20, np.diff(positions, axis=0)
     points = positions[:-1, None] + (np.arange(pieces) + 0.5)[:, None] / pieces * steps[:, None]
     densities = layout.densities(points.reshape(-1, 3)).reshape(len(steps), pieces, -1).mean(axis=1)
@@ -166,7 +195,11 @@ def _env(robot: str, reward: Reward) -> EnvConfig:
 
 def _print(arm: str, name: str, found: list[Driven], own: list[Driven]) -> bool:
     """Print a line; return whether the limit on cost was missed."""
-    pairs = [(a.cost, b.cost) for a, b in zip(found, own, strict=True) if np.isfinite([a.cost, b.cost]).all()]
+    pairs = [
+        (a.cost, b.cost)
+        for a, b in zip(found, own, strict=True)
+        if np.isfinite([a.cost, b.cost]).all()
+    ]
     above = sum(a for a, _ in pairs) / sum(b for _, b in pairs) - 1 if pairs else np.inf
     reached = sum(np.isfinite(one.cost) for one in found)
     cost = f"cost {above:+.1%} on {len(pairs)} layouts" if pairs else "no layout to compare"
@@ -175,7 +208,10 @@ def _print(arm: str, name: str, found: list[Driven], own: list[Driven]) -> bool:
 
 
 def _compare(found: list[Driven], cloned: list[Driven]) -> bool:
-    """Print on how many layouts `found` is cheaper than the clone; return whether that is not significant."""
+    """Print on how many layouts `found` is cheaper than the clone.
+
+    Return whether that is not significant.
+    """
     pairs = [(a.cost, b.cost) for a, b in zip(found, cloned, strict=True)]
     cheaper, dearer = sum(a < b for a, b in pairs), sum(a > b for a, b in pairs)
     p_value = float(binomtest(cheaper, max(1, cheaper + dearer), alternative="greater").pvalue)

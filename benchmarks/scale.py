@@ -1,13 +1,15 @@
-"""How the cost of recording, resuming, checking, training and pushing grows with the number of episodes.
+"""How the cost of recording, resuming, checking, training and pushing grows with the number of
+episodes.
 
 python benchmarks/scale.py [--quick] [--episodes=10000] [--folder=FOLDER] [--plot=FILE]
 
-Fetch's reach, the cheapest task to simulate, on one worker. A recording grows tenfold repeatedly with
-`record --resume=true`; at every size each command runs whole, in a new process. Measures CPU time, which depends little
-on the machine's other load. A new episode: the time of recording minus that of adding one episode, which reads all
-others back and writes the same dataset, divided by the number of new episodes. Memory: the process's peak. Resuming:
-wall time until a new episode is on disk. At the largest size: the wall time of a new episode relative to that of the
-same one in an empty folder, alternating.
+Fetch's reach, the cheapest task to simulate, on one worker. A recording grows tenfold repeatedly
+with `record --resume=true`; at every size each command runs whole, in a new process. Measures CPU
+time, which depends little on the machine's other load. A new episode: the time of recording minus
+that of adding one episode, which reads all others back and writes the same dataset, divided by the
+number of new episodes. Memory: the process's peak. Resuming: wall time until a new episode is on
+disk. At the largest size: the wall time of a new episode relative to that of the same one in an
+empty folder, alternating.
 """
 
 import argparse
@@ -50,7 +52,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Row:
-    """All commands on a dataset of a given size. new: CPU time for one more episode [s]; resumed: wall time [s]."""
+    """All commands on a dataset of a given size. new: CPU time for one more episode [s].
+
+    resumed: wall time [s].
+    """
 
     episodes: int
     new: float
@@ -68,18 +73,31 @@ class Row:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="ten episodes: shows that it runs, measures little")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="ten episodes: shows that it runs, measures little"
+    )
     parser.add_argument("--episodes", type=int, default=10_000)
     parser.add_argument(
-        "--folder", type=Path, help="folder that keeps the results and is continued from; by default a temporary one"
+        "--folder",
+        type=Path,
+        help="folder that keeps the results and is continued from; by default a temporary one",
     )
-    parser.add_argument("--plot", type=Path, help="file for a plot of all measurements in the folder")
+    parser.add_argument(
+        "--plot", type=Path, help="file for a plot of all measurements in the folder"
+    )
     options = parser.parse_args()
     most, first = (10, 10) if options.quick else (options.episodes, FIRST)
     print(describe_machine())
-    print("one entry: processor time, memory; of resuming: wall time until a new episode is on disk")
-    print(f"{'episodes':>9}  " + "  ".join(f"{name:>18}" for name in ("new episode", *COMMANDS[1:])), flush=True)
+    print(
+        "one entry: processor time, memory; of resuming: wall time until a new episode is on disk"
+    )
+    print(
+        f"{'episodes':>9}  " + "  ".join(f"{name:>18}" for name in ("new episode", *COMMANDS[1:])),
+        flush=True,
+    )
     with tempfile.TemporaryDirectory(dir=options.folder) as temporary:
         folder = options.folder or Path(temporary)
         rows, count = read_rows(folder), first
@@ -90,10 +108,16 @@ def main() -> int:
                 before = rows[-1].episodes + 1 if rows else 0
                 rows.append(measure(folder / "demos", count, before))
                 print(rows[-1], flush=True)
-                (folder / ROWS).write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+                (folder / ROWS).write_text(
+                    json.dumps([asdict(row) for row in rows], indent=1) + "\n"
+                )
             count *= 10
         ratios = against_empty(folder, 5 if options.quick else 1_000)
-        print(f"at {rows[-1].episodes:,}, a new episode's time as a multiple of one in an empty folder: ", end="")
+        print(
+            f"at {rows[-1].episodes:,}, a new episode's time as a multiple of one in an empty"
+            " folder: ",
+            end="",
+        )
         print(f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})")
         if options.plot is not None:
             draw(rows, options.plot)
@@ -104,7 +128,10 @@ def read_rows(folder: Path) -> list[Row]:
     if not (folder / ROWS).is_file():
         return []
     rows = json.loads((folder / ROWS).read_text())
-    return [Row(**row | {"runs": {name: Run(**run) for name, run in row["runs"].items()}}) for row in rows]
+    return [
+        Row(**row | {"runs": {name: Run(**run) for name, run in row["runs"].items()}})
+        for row in rows
+    ]
 
 
 def measure(root: Path, count: int, before: int) -> Row:
@@ -123,7 +150,9 @@ def others(root: Path) -> dict[str, Run]:
     runs = {
         "check": manip_il("data", "check", str(root)),
         "info": measured([sys.executable, "-c", info]),
-        "train": manip_il("train", f"--dataset.root={root}", "--steps=1", f"--output_dir={root.with_name('run')}"),
+        "train": manip_il(
+            "train", f"--dataset.root={root}", "--steps=1", f"--output_dir={root.with_name('run')}"
+        ),
         "push": manip_il("push", str(root), f"file://{away}"),
         "pull": manip_il("pull", f"file://{away}", str(back)),
     }
@@ -133,7 +162,9 @@ def others(root: Path) -> dict[str, Run]:
 
 
 def against_empty(folder: Path, episodes: int) -> list[float]:
-    """Return the time of new episodes beside all journals, relative to that of the same ones in an empty folder."""
+    """Return the time of new episodes beside all journals, relative to that of the same ones in
+    an empty folder.
+    """
     journals, empty = folder / "demos.journals", folder / "empty"
     job, after = RolloutJob(make_config("fetch", "reach"), hold=10), max(list_seeds(journals)) + 1
     ratios: list[float] = []
@@ -160,7 +191,9 @@ def collect_seconds(job: RolloutJob, seeds: range, journals: Path) -> float:
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """Plot time and memory against the number of episodes, with their growth over the last decade in the legend."""
+    """Plot time and memory against the number of episodes, with their growth over the last
+    decade in the legend.
+    """
     plt = import_module("matplotlib.pyplot")
     figure, both = plt.subplots(1, 2, figsize=(11, 4.8), layout="constrained")
     sizes = [row.episodes for row in rows]
@@ -171,12 +204,21 @@ def draw(rows: list[Row], path: Path) -> None:
     times |= {name: [row.runs[name].processor for row in rows] for name in COMMANDS[2:]}
     held = {name: [row.runs[name].memory for row in rows] for name in COMMANDS}
     for axes, drawn in zip(both, (times, held), strict=True):
-        for number, (name, values) in enumerate(drawn.items()):  # a command has the same colour on both sides
+        # a command has the same colour on both sides
+        for number, (name, values) in enumerate(drawn.items()):
             power = math.log10(values[-1] / values[-2]) if len(values) > 1 else 0.0
-            axes.plot(sizes, values, "o-", color=f"C{number}", label=f"{name}: n$^{{{max(power, 0.0):.2f}}}$")
+            axes.plot(
+                sizes,
+                values,
+                "o-",
+                color=f"C{number}",
+                label=f"{name}: n$^{{{max(power, 0.0):.2f}}}$",
+            )
         axes.set(xscale="log", xlabel="episodes n")
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.15), frameon=False)
+        axes.legend(
+            fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.15), frameon=False
+        )
     both[0].set(yscale="log", ylabel="time [s]", title="Processor time of a command")
     both[1].set(ylabel="memory [MiB]", title="Most memory held", ylim=(0, None))
     figure.savefig(path, dpi=110)
@@ -184,7 +226,11 @@ def draw(rows: list[Row], path: Path) -> None:
 
 def record(root: Path, count: int) -> tuple[str, ...]:
     resumes = root.with_name(f"{root.name}.journals").exists()
-    sizes = f"--dataset.root={root}", f"--dataset.num_episodes={count}", f"--resume={str(resumes).lower()}"
+    sizes = (
+        f"--dataset.root={root}",
+        f"--dataset.num_episodes={count}",
+        f"--resume={str(resumes).lower()}",
+    )
     return "record", *ENVIRONMENT, *sizes
 
 
@@ -193,7 +239,11 @@ def resume(root: Path, count: int) -> tuple[Run, float]:
     journals = root.with_name(f"{root.name}.journals")
     started, had = time.time(), {path.name for path in os.scandir(journals)}
     run = manip_il(*record(root, count))
-    [new] = [path for path in os.scandir(journals) if path.name not in had and path.name.endswith(".mcap")]
+    [new] = [
+        path
+        for path in os.scandir(journals)
+        if path.name not in had and path.name.endswith(".mcap")
+    ]
     return run, new.stat().st_mtime - started
 
 

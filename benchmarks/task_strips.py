@@ -17,7 +17,8 @@ from manip_il.tasks.table import TASKS
 from manip_il.worlds.ladder.world import make_env
 
 FRAMES = 6  # frames per strip
-CROP = (slice(90, 450), slice(130, 610))  # part of the front camera's picture with the task in it [pixels]
+# part of the front camera's picture with the task in it [pixels]
+CROP = (slice(90, 450), slice(130, 610))
 EPISODES = {"carry": 1}  # index of the episode shown, of the first four; for other tasks the last
 HEIGHT = 180  # height of a strip [pixels]
 DOCS = Path(__file__).parent.parent / "docs" / "tasks"

@@ -1,4 +1,5 @@
-"""Samples per second of training: our in-memory path against LeRobot's DataLoader, on the same data in the same run.
+"""Samples per second of training: our in-memory path against LeRobot's DataLoader, on the same data
+in the same run.
 
 python benchmarks/training_throughput.py [DATASET]
 
@@ -42,11 +43,16 @@ def main() -> None:
             rates = [samples_per_s(step) for step in (peer_feed, our_feed, peer_step, our_step)]
     print(f"{dataset.num_frames} frames, batches of {BATCH}, one thread, samples/s:")
     for what, peer, ours in (("feeding", *rates[:2]), ("optimisation step", *rates[2:])):
-        print(f"{what:18} LeRobot's DataLoader {peer:11,.0f}   ours {ours:11,.0f}   ratio {ours / peer:8.1f}")
+        print(
+            f"{what:18} LeRobot's DataLoader {peer:11,.0f}   ours {ours:11,.0f}   ratio"
+            f" {ours / peer:8.1f}"
+        )
 
 
 def lerobot_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callable[[], object]]:
-    """Return functions that load a batch with LeRobot's loader, and that also update as lerobot-train does."""
+    """Return functions that load a batch with LeRobot's loader, and that also update as
+    lerobot-train does.
+    """
     config = MLPConfig()
     policy = make_policy(config, ds_meta=dataset.meta)
     before, _ = make_pre_post_processors(config)
@@ -65,7 +71,9 @@ def lerobot_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callabl
 
 
 def our_path(root: Path, folder: Path) -> tuple[Callable[[], object], Callable[[], object]]:
-    """Return functions that gather a batch in memory, in the form of LeRobot's processors, and that also update."""
+    """Return functions that gather a batch in memory, in the form of LeRobot's processors, and
+    that also update.
+    """
     config = FitConfig(steps=10**9, batch_size=BATCH, log_freq=10**9)
     trainer = Trainer((Dataset.open(root),), config, folder)
     updates, counter = trainer.run(), iter(range(10**9))
@@ -87,16 +95,24 @@ def endless(loader: torch.utils.data.DataLoader):
         yield from loader
 
 
-def make_dataset(root: Path, episodes: int = 20, length: int = 100, n: int = 8, k: int = 30) -> Path:
+def make_dataset(
+    root: Path, episodes: int = 20, length: int = 100, n: int = 8, k: int = 30
+) -> Path:
     rng = np.random.default_rng(0)
     joints, things = tuple(f"joint_{i}" for i in range(n)), tuple(f"number_{i}" for i in range(k))
     spec = EnvironmentSpec("benchmark", "benchmark", 25, joints, things, 1, "benchmark")
     columns = {key: value for key, value in features(spec).items() if key in LEARNING}
-    dataset = LeRobotDataset.create("manip/benchmark", int(spec.fps), columns, root=root, use_videos=False)
+    dataset = LeRobotDataset.create(
+        "manip/benchmark", int(spec.fps), columns, root=root, use_videos=False
+    )
     for _ in range(episodes):
         for _ in range(length):
             state = rng.normal(size=n).astype(np.float32)
-            frame = {STATE: state, ENVIRONMENT_STATE: rng.normal(size=k).astype(np.float32), ACTION: 0.9 * state}
+            frame = {
+                STATE: state,
+                ENVIRONMENT_STATE: rng.normal(size=k).astype(np.float32),
+                ACTION: 0.9 * state,
+            }
             dataset.add_frame(frame | {LABEL_VALID: np.ones(1, np.int64), "task": spec.instruction})
         dataset.save_episode()
     dataset.finalize()

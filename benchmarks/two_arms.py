@@ -1,4 +1,5 @@
-"""The expert of two arms recovers: a film of both tasks, for `docs/aloha.md`, in which the object is knocked away.
+"""The expert of two arms recovers: a film of both tasks, for `docs/aloha.md`, in which the object
+is knocked away.
 
 Usage: MUJOCO_GL=egl python benchmarks/two_arms.py; writes docs/two_arms.gif, in about two minutes.
 """
@@ -22,7 +23,9 @@ SAID = 18  # control steps after a knock during which the caption names it
 
 
 class Knock(NamedTuple):
-    """An external force on an object, from the first control step in `phase` on. steps: control steps that it lasts."""
+    """An external force on an object, from the first control step in `phase` on. steps: control
+    steps that it lasts.
+    """
 
     task: str
     thing: str
@@ -52,7 +55,11 @@ def film(knock: Knock) -> list[Image.Image]:
         left, caption = left - pushed, SAID if pushed else caption - 1
         env.data.xfrc_applied[body, :3] = knock.force if pushed else 0.0
         if step % EVERY == 0 or solved:
-            frames.append(captioned(env.draw(height=HEIGHT, width=WIDTH, camera_id=CAMERA), phase, caption > 0))
+            frames.append(
+                captioned(
+                    env.draw(height=HEIGHT, width=WIDTH, camera_id=CAMERA), phase, caption > 0
+                )
+            )
         if solved:
             return frames
         solved = env.step(label.action).solved
@@ -77,7 +84,9 @@ def main() -> None:
             frame.paste(one[min(moment, len(one) - 1)], (place * WIDTH, 0))
         frames.append(frame.quantize(COLOURS))
     first, *rest = frames
-    first.save(OUTPUT, save_all=True, append_images=rest, duration=EVERY * 20, loop=0, optimize=True)
+    first.save(
+        OUTPUT, save_all=True, append_images=rest, duration=EVERY * 20, loop=0, optimize=True
+    )
     print(f"{OUTPUT}: {length} frames, {OUTPUT.stat().st_size / 1000:.0f} kB")
 
 

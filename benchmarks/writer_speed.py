@@ -1,12 +1,13 @@
-"""Frames per second written to a LeRobot dataset: our writer against LeRobot's own loop, on the same frames.
+"""Frames per second written to a LeRobot dataset: our writer against LeRobot's own loop, on the
+same frames.
 
 python benchmarks/writer_speed.py [--quick]
 
 Ours is `write_dataset`; the peer is `add_frame` per frame, `save_episode` per episode and
-`finalize`, with its pictures encoded after every episode (its default) or while it records (streaming). Both end with
-the whole dataset on disk and use LeRobot's default video settings. They alternate in the same run; the result is the
-median ratio over the repeats. The peer's time per episode grows with its video file, ours does not, so the ratio is
-larger for longer datasets.
+`finalize`, with its pictures encoded after every episode (its default) or while it records
+(streaming). Both end with the whole dataset on disk and use LeRobot's default video settings. They
+alternate in the same run; the result is the median ratio over the repeats. The peer's time per
+episode grows with its video file, ours does not, so the ratio is larger for longer datasets.
 """
 
 import argparse
@@ -46,22 +47,31 @@ Write = Callable[[Path, s.EnvironmentSpec, list[Episode]], None]
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="few episodes: shows that it runs, measures little")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="few episodes: shows that it runs, measures little"
+    )
     options = parser.parse_args()
     repeats = 1 if options.quick else 3
     datasets.disable_progress_bars()
     logging.disable(logging.WARNING)
     os.environ["SVT_LOG"] = "1"  # otherwise the peer's encoders print a greeting
     print(describe_machine())
-    print("dataset                            LeRobot, frames/s  ours, frames/s  ratio (median, all repeats)")
+    print(
+        "dataset                            LeRobot, frames/s  ours, frames/s  ratio (median, all"
+        " repeats)"
+    )
     for name, spec, episodes, peer in (
         ("state only", STATE_ONLY, 20, peer_default),
         ("two 128 x 128 cameras, default", FILMED, 6, peer_default),
         ("two 128 x 128 cameras, streaming", FILMED, 6, peer_streaming),
     ):
         frames = [make_episode(spec, seed) for seed in range(2 if options.quick else episodes)]
-        measured = np.array([[rate(write, spec, frames) for write in (peer, ours)] for _ in range(repeats)])
+        measured = np.array(
+            [[rate(write, spec, frames) for write in (peer, ours)] for _ in range(repeats)]
+        )
         ratios = measured[:, 1] / measured[:, 0]
         theirs, mine = np.median(measured, axis=0)
         spread = f"{ratios.min():.1f} to {ratios.max():.1f}"
@@ -81,7 +91,9 @@ def ours(root: Path, spec: s.EnvironmentSpec, episodes: list[Episode]) -> None:
     write_dataset(episodes, root, spec, fingerprint={}, video=VideoConfig("libsvtav1"))
 
 
-def peer_default(root: Path, spec: s.EnvironmentSpec, episodes: list[Episode], streaming: bool = False) -> None:
+def peer_default(
+    root: Path, spec: s.EnvironmentSpec, episodes: list[Episode], streaming: bool = False
+) -> None:
     dataset = LeRobotDataset.create(
         REPO,
         int(spec.fps),
@@ -113,7 +125,10 @@ def make_episode(spec: s.EnvironmentSpec, seed: int) -> Episode:
 
 
 def column(rng: np.random.Generator, feature: dict) -> np.ndarray:
-    """Return slow random walks, as arms move little between frames; in pictures a square moves on a gradient."""
+    """Return slow random walks, as arms move little between frames.
+
+    In pictures a square moves on a gradient.
+    """
     shape = (LENGTH, *feature["shape"])
     if feature["dtype"] == "video":
         return film(rng, *feature["shape"][:2])
@@ -124,7 +139,9 @@ def column(rng: np.random.Generator, feature: dict) -> np.ndarray:
 
 def film(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     rows, columns = np.mgrid[:height, :width]
-    still = np.stack([rows + columns, 2 * rows, 2 * columns], axis=-1) // 2 + rng.integers(0, 4, (height, width, 3))
+    still = np.stack([rows + columns, 2 * rows, 2 * columns], axis=-1) // 2 + rng.integers(
+        0, 4, (height, width, 3)
+    )
     frames = np.repeat(still[None].astype(np.uint8), LENGTH, axis=0)
     for t, frame in enumerate(frames):
         frame[40:70, t % (width - 30) :][:, :30] = (200, 40, 30)

@@ -1,8 +1,8 @@
 """Robot-arm imitation learning without a human at the controls.
 
-Importing the package registers its environments with gymnasium, whose import takes a fifth of a second. (Since 1.0
-gymnasium no longer loads plugins from the entry point `gymnasium.envs`.) It also selects the OpenGL backend, because
-mujoco reads MUJOCO_GL only when it is imported.
+Importing the package registers its environments with gymnasium, whose import takes a fifth of a
+second. (Since 1.0 gymnasium no longer loads plugins from the entry point `gymnasium.envs`.) It also
+selects the OpenGL backend, because mujoco reads MUJOCO_GL only when it is imported.
 """
 
 import ctypes.util

@@ -32,5 +32,7 @@ class PerThread[**P, R]:
 def cached_per_thread[**P, R](
     size: int | None = None,
 ) -> Callable[[Callable[P, R]], PerThread[P, R]]:
-    """Return a decorator that keeps a function's last `size` values, all of them if None, for each thread."""
+    """Return a decorator that keeps a function's last `size` values, all of them if None, for
+    each thread.
+    """
     return lambda function: PerThread(function, size)

@@ -1,7 +1,8 @@
 """Check untrusted input: JSON, YAML, names that become paths, numbers and text.
 
-Every check returns the value with its declared type, or raises `ManipError` with one line that names the thing, its
-shortened value and what was expected. `in_child` opens untrusted files in a limited child process.
+Every check returns the value with its declared type, or raises `ManipError` with one line that
+names the thing, its shortened value and what was expected. `in_child` opens untrusted files in a
+limited child process.
 """
 
 import json
@@ -49,16 +50,24 @@ def name(what: str, value: object) -> str:
 
     It may not begin with a dot or contain `..`.
     """
-    if not isinstance(value, str) or not _NAME.fullmatch(value) or len(value) > LONGEST_NAME or ".." in value:
+    if (
+        not isinstance(value, str)
+        or not _NAME.fullmatch(value)
+        or len(value) > LONGEST_NAME
+        or ".." in value
+    ):
         raise ManipError(
-            f"{what} is {shorten(value)}; expected a name of letters, digits and _ . - (no '..', no leading dot, at "
-            f"most {LONGEST_NAME} characters)"
+            f"{what} is {shorten(value)}; expected a name of letters, digits and _ . - (no '..', no"
+            f" leading dot, at most {LONGEST_NAME} characters)"
         )
     return value
 
 
 def task_name(value: object) -> str:
-    """Return a task's name, checked as by `name`; numbers may follow a colon: `NAME:A=NUMBER,B=NUMBER`."""
+    """Return a task's name, checked as by `name`.
+
+    Numbers may follow a colon: `NAME:A=NUMBER,B=NUMBER`.
+    """
     base, colon, numbers = text("task", value).partition(":")
     if colon and not _NUMBERS.fullmatch(numbers):
         raise ManipError(f"task is {shorten(value)}; expected NAME=NUMBER,... after the colon")
@@ -67,14 +76,20 @@ def task_name(value: object) -> str:
 
 
 def object_name(value: object) -> str:
-    """Return an object's text as it is stored: a shape, or a mesh by the name of its file, never by a path."""
+    """Return an object's text as it is stored: a shape, or a mesh by the name of its file, never
+    by a path.
+    """
     if "/" in text("object", value, LONGEST_NAME):
-        raise ManipError(f"object is {shorten(value)}; expected a shape, or a mesh's name without a path")
+        raise ManipError(
+            f"object is {shorten(value)}; expected a shape, or a mesh's name without a path"
+        )
     return text("object", value)
 
 
 def repo_id(what: str, value: object) -> str:
-    """Return the id of a dataset or policy, `NAME` or `USER/NAME`, both parts checked as by `name`."""
+    """Return the id of a dataset or policy, `NAME` or `USER/NAME`, both parts checked as by
+    `name`.
+    """
     user, slash, rest = text(what, value).partition("/")
     return f"{name(what, user)}/{name(what, rest)}" if slash else name(what, user)
 
@@ -82,21 +97,29 @@ def repo_id(what: str, value: object) -> str:
 def text(what: str, value: object, longest: int = LONGEST_TEXT) -> str:
     """Return a string of at most `longest` characters, all of them Unicode."""
     if not isinstance(value, str) or len(value) > longest or _SURROGATE.search(value):
-        raise ManipError(f"{what} is {shorten(value)}; expected text of at most {longest} characters, in Unicode")
+        raise ManipError(
+            f"{what} is {shorten(value)}; expected text of at most {longest} characters, in Unicode"
+        )
     return value
 
 
 def whole(what: str, value: object, low: int, high: int) -> int:
     """Return an int within [low, high]; True and 3.0 are rejected."""
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise ManipError(f"{what} is {shorten(value)}; expected a whole number from {low} to {high}")
+        raise ManipError(
+            f"{what} is {shorten(value)}; expected a whole number from {low} to {high}"
+        )
     return value
 
 
 def number(what: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
     """Return a finite float within [low, high]."""
     most = sys.float_info.max  # a larger int does not fit in a float
-    if isinstance(value, int | float) and not isinstance(value, bool) and max(low, -most) <= value <= min(high, most):
+    if (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and max(low, -most) <= value <= min(high, most)
+    ):
         return float(value)
     limits = "" if math.isinf(low) and math.isinf(high) else f" from {low:g} to {high:g}"
     raise ManipError(f"{what} is {shorten(value)}; expected a finite number{limits}")
@@ -110,10 +133,14 @@ def mapping(what: str, value: object) -> dict[str, Any]:
 
 
 def parse_json(what: str, data: str | bytes) -> Any:
-    """Return the value of a JSON text, None for NaN and Infinity. Raises `ManipError` if it is invalid or too deep."""
+    """Return the value of a JSON text, None for NaN and Infinity.
+
+    Raises `ManipError` if it is invalid or too deep.
+    """
     try:
         return json.loads(data, parse_constant=lambda constant: None)
-    except (RecursionError, ValueError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+    # UnicodeDecodeError and JSONDecodeError are ValueErrors
+    except (RecursionError, ValueError) as error:
         raise ManipError(f"{what} is not valid JSON: {error}") from error
 
 
@@ -125,8 +152,8 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text, read by the safe loader.
 
-    Raises a one-line `ValueError` if it is invalid, if it has more than 100,000 nodes after its aliases are expanded,
-    or if it holds text that is not Unicode.
+    Raises a one-line `ValueError` if it is invalid, if it has more than 100,000 nodes after its
+    aliases are expanded, or if it holds text that is not Unicode.
     """
     import yaml  # imported here because most checks read no YAML
 
@@ -143,9 +170,12 @@ def parse_yaml(text: str) -> Any:
 
 
 def _expanded_size(node: Any, sizes: dict[int, int]) -> int:
-    """Return the number of a YAML node's values after its aliases are expanded; more than allowed for a loop.
+    """Return the number of a YAML node's values after its aliases are expanded.
 
-    sizes: those of the nodes that were counted before, by id. Raises `UnicodeEncodeError` for lone surrogates.
+    More than allowed for a loop.
+
+    sizes: those of the nodes that were counted before, by id. Raises `UnicodeEncodeError` for lone
+    surrogates.
     """
     if isinstance(node.value, str):
         node.value.encode()
@@ -158,7 +188,10 @@ def _expanded_size(node: Any, sizes: dict[int, int]) -> int:
 
 
 def read_yaml(path: Path, what: str) -> Any:
-    """Return the value of a YAML file; `what` is the expected content. Raises `UsageError` if it cannot be read."""
+    """Return the value of a YAML file; `what` is the expected content.
+
+    Raises `UsageError` if it cannot be read.
+    """
     try:
         return parse_yaml(read_bytes(path, what, UsageError, LARGEST_YAML).decode())
     except ValueError as error:  # UnicodeDecodeError is a ValueError
@@ -166,9 +199,12 @@ def read_yaml(path: Path, what: str) -> Any:
 
 
 def open_outside(path: Path, what: str, refusal: type[ManipError] = ManipError) -> BufferedReader:
-    """Open a file from outside for reading; every file that this program did not just write is opened here.
+    """Open a file from outside for reading.
 
-    It never blocks, and it opens only regular files and links to them: no pipes, devices or sockets.
+    Every file that this program did not just write is opened here.
+
+    It never blocks, and it opens only regular files and links to them: no pipes, devices or
+    sockets.
 
     Args:
         path: The file.
@@ -197,7 +233,9 @@ def native_path(path: Path, what: str) -> Iterator[str]:
         yield f"/proc/self/fd/{file.fileno()}"
 
 
-def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError, most: int = LARGEST_READ) -> bytes:
+def read_bytes(
+    path: Path, what: str, refusal: type[ManipError] = ManipError, most: int = LARGEST_READ
+) -> bytes:
     """Return the content of a file that `open_outside` opens.
 
     Args:
@@ -217,7 +255,9 @@ def read_bytes(path: Path, what: str, refusal: type[ManipError] = ManipError, mo
 
 
 def check_unchanged(path: Path) -> None:
-    """Raise `UsageError` if a file was edited since the first call: a process reads a task, robot or mesh only once."""
+    """Raise `UsageError` if a file was edited since the first call: a process reads a task,
+    robot or mesh only once.
+    """
     if path.is_file() and path.read_bytes() != _first_bytes(path.absolute()):
         raise UsageError(f"{path} was edited after this process had read it; start Python again")
 
@@ -228,31 +268,50 @@ def _first_bytes(path: Path) -> bytes:
 
 
 def without_link(path: str, flags: int) -> int:
-    """Open a file for writing, as an `opener` for `open`; raises `OSError` for a link, which could lead to any file."""
+    """Open a file for writing, as an `opener` for `open`.
+
+    Raises `OSError` for a link, which could lead to any file.
+    """
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
-def in_child(what: str, function: Callable[..., object], *arguments: object, seconds: float = SECONDS_IN_CHILD) -> None:
+def in_child(
+    what: str,
+    function: Callable[..., object],
+    *arguments: object,
+    seconds: float = SECONDS_IN_CHILD,
+) -> None:
     """Call `function(*arguments)` in a child process, limited to 4 GB of memory and `seconds` [s].
 
-    Only the text of a `ManipError` comes back, because the file is untrusted. Raises a `ManipError` with that text, and
-    one if the child exceeds its limits or dies. what: name of the file or folder, for these messages; a function that
-    opens several files calls `opening` before each.
+    Only the text of a `ManipError` comes back, because the file is untrusted. Raises a `ManipError`
+    with that text, and one if the child exceeds its limits or dies. what: name of the file or
+    folder, for these messages; a function that opens several files calls `opening` before each.
     """
     command = [sys.executable, "-c", "from manip_il.checks import answer_parent; answer_parent()"]
-    done = subprocess.run(command, input=pickle.dumps((seconds, function, arguments)), capture_output=True, check=False)
+    done = subprocess.run(
+        command,
+        input=pickle.dumps((seconds, function, arguments)),
+        capture_output=True,
+        check=False,
+    )
     *_, last = what, *done.stdout.decode(errors="replace").splitlines()
     if done.returncode == _REFUSED:
         raise ManipError(last)
     if done.returncode != 0:
-        code = "out of memory" if b"bad_alloc" in done.stderr or b"MemoryError" in done.stderr else done.returncode
+        code = (
+            "out of memory"
+            if b"bad_alloc" in done.stderr or b"MemoryError" in done.stderr
+            else done.returncode
+        )
         code = "out of time" if done.returncode == -signal.SIGALRM else code
         limits = f"{MEMORY_IN_CHILD / 1024**3:g} GB of memory and {seconds:g} s"
         raise ManipError(f"{last} cannot be opened in {limits}: {code}")
 
 
 def opening(name: str) -> None:
-    """Report from the child process which file is opened next, and restart the time limit for it."""
+    """Report from the child process which file is opened next, and restart the time limit for
+    it.
+    """
     print(" ".join(name.split()), flush=True)
     _, seconds = signal.getitimer(signal.ITIMER_REAL)
     signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
@@ -263,7 +322,8 @@ def answer_parent() -> None:
     seconds, function, arguments = pickle.load(sys.stdin.buffer)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_IN_CHILD, MEMORY_IN_CHILD))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    signal.setitimer(signal.ITIMER_REAL, seconds, seconds)  # ends the process; `opening` reads the interval
+    # ends the process; `opening` reads the interval
+    signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
     try:
         function(*arguments)
     except ManipError as error:

@@ -11,7 +11,9 @@ from collections.abc import Iterable
 
 OWN = "manip_il_own_"  # prefix of the names of modules that are loaded from users' own files
 _LONGEST_PRINTED = 200  # [characters]
-_REPR = reprlib.Repr(maxstring=_LONGEST_PRINTED, maxlong=_LONGEST_PRINTED, maxother=_LONGEST_PRINTED)
+_REPR = reprlib.Repr(
+    maxstring=_LONGEST_PRINTED, maxlong=_LONGEST_PRINTED, maxother=_LONGEST_PRINTED
+)
 
 
 class ManipError(Exception):
@@ -23,7 +25,9 @@ class ManipError(Exception):
         return printable(super().__str__())
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Pickle the message: subclasses have other arguments, and a worker's errors must reach the main process."""
+        """Pickle the message: subclasses have other arguments, and a worker's errors must reach
+        the main process.
+        """
         return ManipError.__new__, (type(self), str(self))
 
 
@@ -38,7 +42,9 @@ class UnknownName(UsageError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str]):
         known = sorted(known)
-        super().__init__(f"unknown {kind} {shorten(name)}{nearest(name, known)}; known: {', '.join(known)}")
+        super().__init__(
+            f"unknown {kind} {shorten(name)}{nearest(name, known)}; known: {', '.join(known)}"
+        )
 
 
 class MismatchError(ManipError):
@@ -60,7 +66,10 @@ class FolderExistsError(UsageError):
     """An output folder already exists."""
 
     def __init__(self, folder: object):
-        ways = "--resume=true continues it, if the command has that option; --overwrite=true replaces it"
+        ways = (
+            "--resume=true continues it, if the command has that option; --overwrite=true"
+            " replaces it"
+        )
         super().__init__(f"{folder} already exists; {ways}; or choose another folder")
 
 
@@ -69,19 +78,29 @@ class RenderError(ManipError):
 
 
 def nearest(name: str, known: Iterable[str], most: int = 1) -> str:
-    """Return ` (did you mean 'x' or 'y'?)` with at most `most` known names like `name`, or "" if none is near."""
+    """Return ` (did you mean 'x' or 'y'?)` with at most `most` known names like `name`, or "" if
+    none is near.
+    """
     near = difflib.get_close_matches(name, list(known), most)
     return f" (did you mean {' or '.join(map(repr, near))}?)" if near else ""
 
 
 def printable(text: str) -> str:
-    """Escape control characters except line breaks and tabs, so that a terminal does not obey them."""
+    """Escape control characters except line breaks and tabs, so that a terminal does not obey
+    them.
+    """
     return "".join(one if one.isprintable() or one in "\n\t" else repr(one)[1:-1] for one in text)
 
 
 def told(error: BaseException) -> str:
-    """Return an unexpected error as text, with file, line and function if a user's own file raised it."""
-    frames = [one for one in traceback.walk_tb(error.__traceback__) if one[0].f_globals["__name__"].startswith(OWN)]
+    """Return an unexpected error as text, with file, line and function if a user's own file
+    raised it.
+    """
+    frames = [
+        one
+        for one in traceback.walk_tb(error.__traceback__)
+        if one[0].f_globals["__name__"].startswith(OWN)
+    ]
     text = f"{type(error).__name__}: {error}"
     if not frames:
         return text
@@ -90,11 +109,16 @@ def told(error: BaseException) -> str:
 
 
 def shorten(value: object) -> str:
-    """Return `repr(value)`, cut to at most 200 characters; a large structure is shown by its first values."""
+    """Return `repr(value)`, cut to at most 200 characters.
+
+    A large structure is shown by its first values.
+    """
     printed = _REPR.repr(value)
     return printed if len(printed) <= _LONGEST_PRINTED else f"{printed[: _LONGEST_PRINTED - 3]}..."
 
 
 def silence_ffmpeg_warning() -> None:
-    """Hide LeRobot's long warning about missing FFmpeg libraries: we read video with PyAV, which has its own."""
+    """Hide LeRobot's long warning about missing FFmpeg libraries: we read video with PyAV, which
+    has its own.
+    """
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)

@@ -1,7 +1,7 @@
 """States, observations, labels, transitions and episodes: the types that all packages share.
 
-Every type is frozen, and raises on construction if lengths disagree or a value is not finite. Numpy only. Vectors
-over joints have length `n` = arm joints + 1: arm [rad], gripper opening [m].
+Every type is frozen, and raises on construction if lengths disagree or a value is not finite. Numpy
+only. Vectors over joints have length `n` = arm joints + 1: arm [rad], gripper opening [m].
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Images = Mapping[str, NDArray[np.uint8]]  # camera -> (B, H, W, 3)
 IMAGES = "observation.images."  # prefix of a camera's picture column
-KEYPOINTS = "privileged.keypoints."  # prefix of a camera's keypoint column; stored only with its pictures
+# prefix of a camera's keypoint column; stored only with its pictures
+KEYPOINTS = "privileged.keypoints."
 STATE_EXTRAS = 4  # numbers in a `sim_state` besides physics and variation
 
 
@@ -37,11 +38,12 @@ class Actor(IntEnum):
 class State:
     """The full, privileged state: enough to restore the simulator exactly.
 
-    physics: MuJoCo's integration state, (p,), including goals and fixed furniture as mocap poses. variation: every
-    model parameter that was drawn for the episode, (v,). step: control steps since reset. streak: consecutive control
-    steps within the tolerance. ever: whether the episode has succeeded at some step. seed: of the episode, which
-    decides the noise and knocks of its later steps; None in a state that was read from a dataset, whose `seed` column
-    has it. begun: whether the knock of the control step that follows, if there is one, has happened already.
+    physics: MuJoCo's integration state, (p,), including goals and fixed furniture as mocap poses.
+    variation: every model parameter that was drawn for the episode, (v,). step: control steps since
+    reset. streak: consecutive control steps within the tolerance. ever: whether the episode has
+    succeeded at some step. seed: of the episode, which decides the noise and knocks of its later
+    steps; None in a state that was read from a dataset, whose `seed` column has it. begun: whether
+    the knock of the control step that follows, if there is one, has happened already.
     """
 
     physics: F64
@@ -72,10 +74,13 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a policy observes. state: (n,); environment_state: (k,), privileged, for state-based policies.
+    """What a policy observes. state: (n,).
 
-    instruction: the task in words, for policies that read language. keypoints: image coordinates of named points of the
-    scene, across and down in [0, 1], and 1 if the point is within the picture, else 0; privileged.
+    environment_state: (k,), privileged, for state-based policies.
+
+    instruction: the task in words, for policies that read language. keypoints: image coordinates of
+    named points of the scene, across and down in [0, 1], and 1 if the point is within the picture,
+    else 0; privileged.
     """
 
     state: F32
@@ -93,9 +98,9 @@ class Observation:
 class Label:
     """The expert's label of one state.
 
-    action: joint targets [rad] and gripper command [m], (n,). phase: number of the task's phase, 0 for none. residual:
-    fraction of the hand's pose error that remains after the step, in [0, 1]. If `valid` is false, `reason` says why and
-    `action` holds the arm still.
+    action: joint targets [rad] and gripper command [m], (n,). phase: number of the task's phase, 0
+    for none. residual: fraction of the hand's pose error that remains after the step, in [0, 1]. If
+    `valid` is false, `reason` says why and `action` holds the arm still.
     """
 
     action: F64
@@ -112,8 +117,9 @@ class Label:
 class Transition:
     """One control step of one episode: all content of a dataset's frame.
 
-    `state`, `observation` and `progress` are from before the step; `reward`, `success`, `done` from after it.
-    `success`: whether the last `success_steps` steps were all within the tolerance. `done` marks the last frame.
+    `state`, `observation` and `progress` are from before the step; `reward`, `success`, `done` from
+    after it. `success`: whether the last `success_steps` steps were all within the tolerance.
+    `done` marks the last frame.
     """
 
     seed: int
@@ -131,12 +137,13 @@ class Transition:
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """A finished episode as columns, with the dataset's names (without LeRobot's own index columns).
+    """A finished episode as columns, with the dataset's names (without LeRobot's own index
+    columns).
 
-    columns: name -> array (T, ...). success: whether the goal was held, at some time, for the required number of
-    consecutive steps; success_at_end: whether it was so at the last frame. instruction: the task in words, for policies
-    that read language; empty for the task's own text. drawn: how the episode's world differed from the nominal
-    one: range name -> plain JSON value.
+    columns: name -> array (T, ...). success: whether the goal was held, at some time, for the
+    required number of consecutive steps; success_at_end: whether it was so at the last frame.
+    instruction: the task in words, for policies that read language; empty for the task's own text.
+    drawn: how the episode's world differed from the nominal one: range name -> plain JSON value.
     """
 
     seed: int
@@ -159,15 +166,21 @@ class Episode:
         return len(next(iter(self.columns.values())))
 
     def without_pictures(self) -> Episode:
-        """Return the episode without its columns of pictures (T, height, width, 3) and their keypoints."""
+        """Return the episode without its columns of pictures (T, height, width, 3) and their
+        keypoints.
+        """
         columns = {
-            key: column for key, column in self.columns.items() if column.ndim < 4 and not key.startswith(KEYPOINTS)
+            key: column
+            for key, column in self.columns.items()
+            if column.ndim < 4 and not key.startswith(KEYPOINTS)
         }
         return replace(self, columns=columns)
 
 
 def require_finite(what: str, values: NDArray[np.generic]) -> None:
-    """Raise `NotFiniteError` naming `what` and the first bad row, unless all values (T, ...) are finite."""
+    """Raise `NotFiniteError` naming `what` and the first bad row, unless all values (T, ...) are
+    finite.
+    """
     if values.dtype.kind != "f":
         return
     if np.isfinite(values).all():

@@ -12,24 +12,29 @@ from typing import Any
 
 from manip_il.errors import UnknownName, UsageError, shorten
 
-NameOrPath = str | Path  # of a robot, a task or an object: only a `Path` is ever opened, see `typed`
-_FILES = (".py", ".yaml", ".yml", ".json")  # suffixes of files with a user's own task, robot or reward
+# of a robot, a task or an object: only a `Path` is ever opened, see `typed`
+NameOrPath = str | Path
+# suffixes of files with a user's own task, robot or reward
+_FILES = (".py", ".yaml", ".yml", ".json")
 
 
 def typed(text: NameOrPath) -> NameOrPath:
-    """Return a robot, a task or an object that a person typed: a `Path` if it names a file, else the name itself.
+    """Return a robot, a task or an object that a person typed: a `Path` if it names a file, else
+    the name itself.
 
-    Only a `Path` is ever opened. What a dataset, a checkpoint or a result names is a `str`, which is looked up among
-    the known names alone, so it must never be passed to this function.
+    Only a `Path` is ever opened. What a dataset, a checkpoint or a result names is a `str`, which
+    is looked up among the known names alone, so it must never be passed to this function.
     """
     said = str(text)
     return Path(said) if said.startswith("mesh:") or said.endswith(_FILES) else text
 
 
 def option(default: Any, help_text: str, **metadata: Any) -> Any:
-    """Return a dataclass field. default: a value, a class or function that makes one, or `MISSING` for none.
+    """Return a dataclass field. default: a value, a class or function that makes one, or `MISSING`
+    for none.
 
-    metadata: `at_least` and `at_most` (see `check_bound`), and the keys of `manip_il.cli.parsing.Option`.
+    metadata: `at_least` and `at_most` (see `check_bound`), and the keys of
+    `manip_il.cli.parsing.Option`.
     """
     metadata = {"help": help_text, **metadata}
     if callable(default):
@@ -38,7 +43,9 @@ def option(default: Any, help_text: str, **metadata: Any) -> Any:
 
 
 def keyword(default: Any, help_text: str, **metadata: Any) -> Any:
-    """Return a field like `option`, which stays a keyword if a class without `kw_only` declares it again."""
+    """Return a field like `option`, which stays a keyword if a class without `kw_only` declares
+    it again.
+    """
     made = option(Path(default) if isinstance(default, str) else default, help_text, **metadata)
     made.kw_only = True
     return made
@@ -57,7 +64,9 @@ def option_of(cls: type, name: str) -> Any:
 
 
 def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
-    """Raise `UsageError` if a value that is not None is below `at_least` or above `at_most` in a field's metadata."""
+    """Raise `UsageError` if a value that is not None is below `at_least` or above `at_most` in a
+    field's metadata.
+    """
     if value is None or not {"at_least", "at_most"} & metadata.keys():
         return
     low, high = metadata.get("at_least", -math.inf), metadata.get("at_most", math.inf)
@@ -67,7 +76,9 @@ def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
 
 
 def check_bounds(options: Any, prefix: str = "") -> None:
-    """Raise `UsageError` if a field of a dataclass instance has another type, or is outside its metadata's bounds."""
+    """Raise `UsageError` if a field of a dataclass instance has another type, or is outside its
+    metadata's bounds.
+    """
     for one in fields(options):
         value = getattr(options, one.name)
         _check_type(prefix + one.name, value, one, type(options))
@@ -85,9 +96,16 @@ def _check_type(name: str, value: Any, one: Field[Any], cls: type) -> None:
 
 
 def type_of(cls: type, one: Field[Any]) -> Any:
-    """Return the type of one field of a dataclass. The annotations of its other fields are not evaluated."""
+    """Return the type of one field of a dataclass.
+
+    The annotations of its other fields are not evaluated.
+    """
     home = next(base for base in cls.__mro__ if one.name in vars(base).get("__annotations__", {}))
-    return eval(one.type, vars(sys.modules[home.__module__])) if isinstance(one.type, str) else one.type
+    return (
+        eval(one.type, vars(sys.modules[home.__module__]))
+        if isinstance(one.type, str)
+        else one.type
+    )
 
 
 def _is_of(value: Any, kind: Any) -> bool:
@@ -106,7 +124,10 @@ def _is_of(value: Any, kind: Any) -> bool:
 
 
 def make_options[T](cls: type[T], **options: Any) -> T:
-    """Return an instance of a dataclass of options. Raises `UnknownName` for an option that it does not have."""
+    """Return an instance of a dataclass of options.
+
+    Raises `UnknownName` for an option that it does not have.
+    """
     known = [one.name for one in fields(typing.cast(Any, cls))]
     for name in options:
         if name not in known:
@@ -118,4 +139,6 @@ def make_options[T](cls: type[T], **options: Any) -> T:
 class Seeded:
     """Options of everything that draws random numbers."""
 
-    seed: int = option(0, "random seed, 0 to 1000; it shifts every random stream", at_least=0, at_most=1000)
+    seed: int = option(
+        0, "random seed, 0 to 1000; it shifts every random stream", at_least=0, at_most=1000
+    )

@@ -1,8 +1,9 @@
 """Named random streams with disjoint seeds.
 
-An episode's seed is `stream_base(stream) + index`. Each stream has a block of `BLOCK` seeds, and each value of the
-user's `--seed` shifts all streams to other blocks, so that demonstrations, every DAgger round, training, validation
-and the final test never share a seed, and no stream holds 1000, LeRobot's default seed.
+An episode's seed is `stream_base(stream) + index`. Each stream has a block of `BLOCK` seeds, and
+each value of the user's `--seed` shifts all streams to other blocks, so that demonstrations, every
+DAgger round, training, validation and the final test never share a seed, and no stream holds 1000,
+LeRobot's default seed.
 """
 
 import zlib
@@ -30,7 +31,8 @@ MAX_SEED = 1_000
 
 
 def stream_base(stream: str, seed: int = 0) -> int:
-    """Return the first seed of a named stream (`demonstrations`, `training`, `validation`, `test`, `round/3`).
+    """Return the first seed of a named stream (`demonstrations`, `training`, `validation`, `test`,
+    `round/3`).
 
     Raises `UsageError` for a `seed` outside [0, 1000].
     """
@@ -48,10 +50,11 @@ def stream_seeds(stream: str, count: int, seed: int = 0) -> range:
 
 
 def rng_for(seed: int, purpose: str, *step: int) -> np.random.Generator:
-    """Return a generator for one purpose (`reset`, `mixture`, `noise`, ...) in the episode of a seed, or in one step.
+    """Return a generator for one purpose (`reset`, `mixture`, `noise`, ...) in the episode of a
+    seed, or in one step.
 
-    What happens in a step of an environment is drawn from a generator of that step, and so does not depend on the steps
-    that the environment has made before: a restored state has the same future.
+    What happens in a step of an environment is drawn from a generator of that step, and so does not
+    depend on the steps that the environment has made before: a restored state has the same future.
     """
     return np.random.default_rng([seed, zlib.crc32(purpose.encode()), *step])
 

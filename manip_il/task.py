@@ -1,4 +1,6 @@
-"""What a task of one's own is written with: `from manip_il.task import Rung, Start, Target, Task, World, hand_down`."""
+"""What a task of one's own is written with: `from manip_il.task import Rung, Start, Target,
+Task, World, hand_down`.
+"""
 
 from manip_il.robots.geometry import hand_down
 from manip_il.sim.shape import ObjectShape

@@ -22,14 +22,16 @@ from manip_il.progress import Progress
 from .faults.child import run_command
 from .warm import Warm
 
-# The same examples in every run, so that a change that passes here passes elsewhere. How long an example takes says
-# something about the machine, nothing about the program.
-settings.register_profile("manip_il", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# The same examples in every run, so that a change that passes here passes elsewhere. How long an
+# example takes says something about the machine, nothing about the program.
+settings.register_profile(
+    "manip_il", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("manip_il")
 
-# Rollout workers, and commands that are to be killed, are forked from one server a process, and what it imports when it
-# starts decides for all: without this the first test to need it decides, and every later worker that drives a policy
-# imports torch and LeRobot anew, six seconds each.
+# Rollout workers, and commands that are to be killed, are forked from one server a process, and
+# what it imports when it starts decides for all: without this the first test to need it decides,
+# and every later worker that drives a policy imports torch and LeRobot anew, six seconds each.
 IMPORTED_ONCE = [
     "manip_il.cli.imitation",
     "manip_il.cli.evaluate",
@@ -57,7 +59,8 @@ def watching(**methods: Callable[..., object]) -> Progress:
 LARGE = 1_000_000_000  # of a process [bytes]
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
 
-# The files that take longest (`pytest --durations=0`), longest first: begun late, one of them is what all wait for.
+# The files that take longest (`pytest --durations=0`), longest first: begun late, one of them is
+# what all wait for.
 LONG = (
     "docs/test_commands.py",
     "course/test_notebooks.py",
@@ -77,7 +80,9 @@ LONG = (
 
 @pytest.fixture(autouse=True)
 def _ordinary_scheduling() -> Iterator[None]:
-    """Take back the real-time priority that LeRobot's encoder, run by root, gives to this process for good."""
+    """Take back the real-time priority that LeRobot's encoder, run by root, gives to this
+    process for good.
+    """
     _take_back()
     yield
     _take_back()
@@ -94,13 +99,16 @@ def _take_back() -> None:
 def _caches_are_freed(request: pytest.FixtureRequest) -> Iterator[None]:
     """Free what a file keeps for its own tests after them.
 
-    Caches of the package and of MuJoCo are kept for the next file unless this process has grown large.
+    Caches of the package and of MuJoCo are kept for the next file unless this process has grown
+    large.
     """
     from manip_il.caching import PerThread
 
     yield
     large = _resident() > LARGE
-    modules = [module for name, module in sys.modules.items() if large and name.startswith("manip_il.")]
+    modules = [
+        module for name, module in sys.modules.items() if large and name.startswith("manip_il.")
+    ]
     for kept in [one for module in (request.module, *modules) for one in vars(module).values()]:
         cache = kept.own if isinstance(kept, PerThread) else kept
         if isinstance(cache, functools._lru_cache_wrapper):
@@ -114,7 +122,9 @@ def _caches_are_freed(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _allocator_gives_back() -> Iterator[None]:
-    """Give back what the allocator holds of freed memory: glibc keeps all of it once a large model was freed."""
+    """Give back what the allocator holds of freed memory: glibc keeps all of it once a large
+    model was freed.
+    """
     yield
     if _TRIM is not None and _resident() > LARGE:
         _TRIM(0)
@@ -141,7 +151,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def _logging_as_before() -> Iterator[None]:
-    """LeRobot's commands set the root logger up, with a handler of the test's own standard error."""
+    """LeRobot's commands set the root logger up, with a handler of the test's own standard
+    error.
+    """
     root = logging.getLogger()
     level, handlers = root.level, list(root.handlers)
     yield
@@ -152,10 +164,14 @@ def _logging_as_before() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def start() -> Callable[..., ForkServerProcess]:
-    """Starts a command in a process of its own within milliseconds: what it imports is loaded once."""
+    """Starts a command in a process of its own within milliseconds: what it imports is loaded
+    once.
+    """
     context = multiprocessing.get_context("forkserver")
 
-    def begin(*words: str, log: Path, warm: bool = False, largest_file: int = 0) -> ForkServerProcess:
+    def begin(
+        *words: str, log: Path, warm: bool = False, largest_file: int = 0
+    ) -> ForkServerProcess:
         process = context.Process(target=run_command, args=(words, str(log), warm, largest_file))
         process.start()
         return process
@@ -165,7 +181,9 @@ def start() -> Callable[..., ForkServerProcess]:
 
 @pytest.fixture(scope="module")  # it takes half a gigabyte
 def warm_lerobot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Warm]:
-    """Runs LeRobot's commands, and scripts that use it, without network and with a home of its own."""
+    """Runs LeRobot's commands, and scripts that use it, without network and with a home of its
+    own.
+    """
     environment = os.environ | {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": "", "SVT_LOG": "1"}
     with Warm(environment, tmp_path_factory.mktemp("home")) as warm:
         yield warm

@@ -42,12 +42,16 @@ def cut(path: Path, keep: float) -> None:
 
 def digests(root: Path) -> dict[str, str]:
     files = sorted(path for path in root.rglob("*") if path.is_file())
-    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files
+    }
 
 
 def check_same_data(run: Path, other: Path) -> None:
     """Check that two runs have the same files, of which those of data have the same bytes."""
     ours, theirs = digests(run), digests(other)
     assert ours.keys() == theirs.keys()
-    data = [name for name in ours if name.endswith((".parquet", ".mcap", ".safetensors", "eval.json"))]
+    data = [
+        name for name in ours if name.endswith((".parquet", ".mcap", ".safetensors", "eval.json"))
+    ]
     assert [ours[name] for name in data] == [theirs[name] for name in data]

@@ -1,4 +1,6 @@
-"""Ten objects as meshes, made of numbers: each function returns a closed `Trimesh` in metres, z up."""
+"""Ten objects as meshes, made of numbers: each function returns a closed `Trimesh` in metres, z
+up.
+"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,29 +23,41 @@ def prism(
     return trimesh.Trimesh(points, faces)
 
 
-def tube(way: Sequence[tuple[float, float, float]], radii: Sequence[float], sides: int = 16) -> trimesh.Trimesh:
+def tube(
+    way: Sequence[tuple[float, float, float]], radii: Sequence[float], sides: int = 16
+) -> trimesh.Trimesh:
     """A tube along a way in the plane of x and z, with a tip at either end."""
     path, rings = np.asarray(way, float), []
     for at, along, radius in zip(path, np.gradient(path, axis=0), radii, strict=True):
         across = np.cross((0, 1.0, 0), along / np.linalg.norm(along))
         angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
-        rings.append(at + radius * (np.outer(np.cos(angles), across) + np.outer(np.sin(angles), (0, 1.0, 0))))
+        rings.append(
+            at + radius * (np.outer(np.cos(angles), across) + np.outer(np.sin(angles), (0, 1.0, 0)))
+        )
     ring, last = np.arange(sides), (len(path) - 1) * sides
     after, faces = np.roll(ring, -1), []
     for start in range(0, last, sides):
         a, b = start + ring, start + after
         faces += [*np.c_[a, b, a + sides], *np.c_[b, b + sides, a + sides]]
     ends = len(path) * sides
-    faces += [*np.c_[after, ring, np.full(sides, ends)], *np.c_[last + ring, last + after, np.full(sides, ends + 1)]]
+    faces += [
+        *np.c_[after, ring, np.full(sides, ends)],
+        *np.c_[last + ring, last + after, np.full(sides, ends + 1)],
+    ]
     solid = trimesh.Trimesh(np.vstack([*rings, path[0], path[-1]]), np.array(faces))
     solid.fix_normals()
     return solid
 
 
 def mug() -> trimesh.Trimesh:
-    cup = revolve([(0, 0), (0.027, 0), (0.027, 0.065), (0.024, 0.065), (0.024, 0.004), (0, 0.004)], sections=32)
+    cup = revolve(
+        [(0, 0), (0.027, 0), (0.027, 0.065), (0.024, 0.065), (0.024, 0.004), (0, 0.004)],
+        sections=32,
+    )
     turn = np.linspace(-np.pi / 2, np.pi / 2, 9)
-    handle = tube([(0.0255 + 0.016 * np.cos(t), 0, 0.033 + 0.02 * np.sin(t)) for t in turn], [0.004] * 9)
+    handle = tube(
+        [(0.0255 + 0.016 * np.cos(t), 0, 0.033 + 0.02 * np.sin(t)) for t in turn], [0.004] * 9
+    )
     return trimesh.util.concatenate([cup, handle])
 
 
@@ -59,7 +73,11 @@ def banana() -> trimesh.Trimesh:
 
 
 def angle() -> trimesh.Trimesh:
-    return prism([(0, 0), (0.07, 0), (0.07, 0.025), (0.025, 0.025), (0.025, 0.06), (0, 0.06)], 0.025, (0.012, 0.012))
+    return prism(
+        [(0, 0), (0.07, 0), (0.07, 0.025), (0.025, 0.025), (0.025, 0.06), (0, 0.06)],
+        0.025,
+        (0.012, 0.012),
+    )
 
 
 def wedge() -> trimesh.Trimesh:
@@ -69,7 +87,10 @@ def wedge() -> trimesh.Trimesh:
 
 def star() -> trimesh.Trimesh:
     turns = np.arange(10) * np.pi / 5
-    return prism([(r * np.cos(t), r * np.sin(t)) for t, r in zip(turns, (0.03, 0.014) * 5, strict=True)], 0.035)
+    return prism(
+        [(r * np.cos(t), r * np.sin(t)) for t, r in zip(turns, (0.03, 0.014) * 5, strict=True)],
+        0.035,
+    )
 
 
 def bowl() -> trimesh.Trimesh:

@@ -1,4 +1,7 @@
-"""Episodes whose pictures hold their number, as twelve squares, light for a one; and the frames of video files."""
+"""Episodes whose pictures hold their number, as twelve squares, light for a one.
+
+And the frames of video files.
+"""
 
 import io
 import json
@@ -49,8 +52,13 @@ def numbers_of(pictures: np.ndarray) -> list[int]:
     return [number_of(picture) for picture in pictures]
 
 
-def numbered_episodes(make_episode: Callable[..., Episode], spec: s.EnvironmentSpec, count: int = 3) -> list[Episode]:
-    """Of lengths 7, 1 and 13 in turn; pictures count on through all episodes of one camera, then of the next."""
+def numbered_episodes(
+    make_episode: Callable[..., Episode], spec: s.EnvironmentSpec, count: int = 3
+) -> list[Episode]:
+    """Of lengths 7, 1 and 13 in turn.
+
+    Pictures count on through all episodes of one camera, then of the next.
+    """
     lengths = [LENGTHS[index % 3] for index in range(count)]
     starts = np.cumsum([0, *lengths])
     episodes: list[Episode] = []
@@ -73,18 +81,29 @@ def encoded(picture: np.ndarray, kind: str = "PNG") -> bytes:
 
 
 def store_pictures(root: Path, key: str, pictures: list[bytes], size: tuple[int, int]) -> Path:
-    """Give a dataset a camera of LeRobot's dtype `image`, whose pictures are in its data file; return that file."""
+    """Give a dataset a camera of LeRobot's dtype `image`, whose pictures are in its data file.
+
+    Return that file.
+    """
     path = root / DATA
     kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
     cells = pa.array([{"bytes": content, "path": None} for content in pictures], kind)
     pq.write_table(pq.read_table(path).append_column(key, cells), path, row_group_size=5)
-    feature: dict[str, Any] = {"dtype": "image", "shape": [*size, 3], "names": ["height", "width", "channels"]}
+    feature: dict[str, Any] = {
+        "dtype": "image",
+        "shape": [*size, 3],
+        "names": ["height", "width", "channels"],
+    }
     edit_json(root / INFO, lambda info: info["features"].update({key: feature}))
     return path
 
 
 def write(
-    episodes: list[Episode], root: Path, spec: s.EnvironmentSpec, size: float | None = None, **options: Any
+    episodes: list[Episode],
+    root: Path,
+    spec: s.EnvironmentSpec,
+    size: float | None = None,
+    **options: Any,
 ) -> Path:
     """Write a dataset with options of `write_dataset`. size: of its files [MB]."""
     with pytest.MonkeyPatch.context() as patch:
@@ -100,17 +119,31 @@ def read_episodes(root: Path) -> Iterator[Episode]:
     shapes = {key: one["shape"] for key, one in s.features(dataset.spec).items()}
     names = [key for key in shapes if key not in dataset.spec.image_keys]
     for one in dataset.stored_episodes(names):
-        columns = {key: dataset.frames(key, dataset.rows_of(one.number)) for key in dataset.spec.image_keys}
+        columns = {
+            key: dataset.frames(key, dataset.rows_of(one.number)) for key in dataset.spec.image_keys
+        }
         columns |= {key: one.columns[key].reshape(-1, *shapes[key]) for key in names}
         solved, drawn = columns[s.SUCCESS], json.loads(one.others[lerobot_layout.DRAWN] or "{}")
         ends = bool(solved.any()), bool(solved[-1])
-        yield Episode(int(columns[s.SEED][0, 0]), {key: columns[key] for key in shapes}, *ends, one.tasks[0], drawn)
+        yield Episode(
+            int(columns[s.SEED][0, 0]),
+            {key: columns[key] for key in shapes},
+            *ends,
+            one.tasks[0],
+            drawn,
+        )
 
 
 def assert_comes_back(root: Path, episodes: list[Episode]) -> None:
-    """A dataset holds these episodes: numbers bit for bit, pictures by the number that they show."""
+    """A dataset holds these episodes: numbers bit for bit, pictures by the number that they
+    show.
+    """
     for mine, yours in zip(read_episodes(root), episodes, strict=True):
-        assert (mine.seed, mine.success, mine.success_at_end) == (yours.seed, yours.success, yours.success_at_end)
+        assert (mine.seed, mine.success, mine.success_at_end) == (
+            yours.seed,
+            yours.success,
+            yours.success_at_end,
+        )
         assert list(mine.columns) == list(yours.columns)
         for key, values in yours.columns.items():
             assert mine.columns[key].dtype == values.dtype

@@ -18,11 +18,15 @@ SIZES = Condition("sizes", size=(0.03, 0.07), mass=(0.05, 0.3))
 
 def sizes_of(task: str) -> list[Condition]:
     """The other sizes and masses that a task can take."""
-    varied = SIZES.for_world(has_object=bool(TASKS[task].objects), sees=False, sizes=TASKS[task].sizes)
+    varied = SIZES.for_world(
+        has_object=bool(TASKS[task].objects), sees=False, sizes=TASKS[task].sizes
+    )
     return [] if varied is None else [varied]
 
 
-def started(robot: str = "panda", task: str = "pick_place", seed: int = SEED, **settings: Any) -> ManipEnv:
+def started(
+    robot: str = "panda", task: str = "pick_place", seed: int = SEED, **settings: Any
+) -> ManipEnv:
     env = make_env(robot, task, **settings)
     env.start(seed)
     return env
@@ -42,8 +46,12 @@ def has_goal(world: World) -> bool:
 
 
 def still(env: ManipEnv, opening: float | None = None) -> np.ndarray:
-    """The action that holds the arm where it is commanded to be, and the fingers where they are or at an opening."""
-    return env.scene.actions.join(env.data.ctrl[env.scene.arm_ctrl], env.world.opening if opening is None else opening)
+    """The action that holds the arm where it is commanded to be, and the fingers where they are
+    or at an opening.
+    """
+    return env.scene.actions.join(
+        env.data.ctrl[env.scene.arm_ctrl], env.world.opening if opening is None else opening
+    )
 
 
 def bits(env: ManipEnv) -> bytes:

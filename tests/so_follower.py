@@ -1,4 +1,5 @@
-"""The real SO-101 as LeRobot's own `SOFollower`, with a bus that has no wire: its servos stand where they are put.
+"""The real SO-101 as LeRobot's own `SOFollower`, with a bus that has no wire: its servos stand
+where they are put.
 
 Units, names and features are all LeRobot's; ours are compared with them.
 """
@@ -8,7 +9,11 @@ from typing import Any
 
 import numpy as np
 from lerobot.configs import RGBEncoderConfig
-from lerobot.datasets import LeRobotDataset, aggregate_pipeline_dataset_features, create_initial_features
+from lerobot.datasets import (
+    LeRobotDataset,
+    aggregate_pipeline_dataset_features,
+    create_initial_features,
+)
 from lerobot.motors import MotorCalibration
 from lerobot.motors.feetech import FeetechMotorsBus
 from lerobot.processor import make_default_processors
@@ -45,7 +50,9 @@ class Bus(FeetechMotorsBus):
 
     def stand(self, joints: dict[str, float]) -> None:
         """Put servos at angles [rad] of the model's joints, as far as their steps allow."""
-        self.steps |= {name: round(MIDDLE + angle * TURN / (2 * np.pi)) for name, angle in joints.items()}
+        self.steps |= {
+            name: round(MIDDLE + angle * TURN / (2 * np.pi)) for name, angle in joints.items()
+        }
 
 
 class Camera:
@@ -61,12 +68,21 @@ class Camera:
         return self.picture
 
 
-def arm(monkeypatch: Any, limits: dict[str, tuple[float, float]], cameras: dict[str, Camera] | None = None) -> Any:
-    """A connected arm, calibrated to joints' limits [rad] in the model, as docs/real-robot.md asks for."""
+def arm(
+    monkeypatch: Any,
+    limits: dict[str, tuple[float, float]],
+    cameras: dict[str, Camera] | None = None,
+) -> Any:
+    """A connected arm, calibrated to joints' limits [rad] in the model, as docs/real-robot.md
+    asks for.
+    """
     monkeypatch.setattr(so_follower, "FeetechMotorsBus", Bus)
     robot: Any = SOFollower(SOFollowerRobotConfig(port="none", id="none"))
     robot.cameras = cameras or {}
-    ends = {name: [round(MIDDLE + end * TURN / (2 * np.pi)) for end in limits[name]] for name in robot.bus.motors}
+    ends = {
+        name: [round(MIDDLE + end * TURN / (2 * np.pi)) for end in limits[name]]
+        for name in robot.bus.motors
+    }
     ends["wrist_roll"] = [0, 4095]  # as LeRobot calibrates it
     for number, (name, (low, high)) in enumerate(ends.items(), start=1):
         robot.bus.calibration[name] = MotorCalibration(number, 0, 0, low, high)
@@ -74,11 +90,15 @@ def arm(monkeypatch: Any, limits: dict[str, tuple[float, float]], cameras: dict[
 
 
 def recorders_features(robot: Any) -> dict[str, Any]:
-    """The features of a dataset that lerobot-record makes for a robot, as `lerobot_record.record` makes them."""
+    """The features of a dataset that lerobot-record makes for a robot, as
+    `lerobot_record.record` makes them.
+    """
     teleop, _, observation = make_default_processors()
     return combine_feature_dicts(
         aggregate_pipeline_dataset_features(
-            pipeline=teleop, initial_features=create_initial_features(action=robot.action_features), use_videos=True
+            pipeline=teleop,
+            initial_features=create_initial_features(action=robot.action_features),
+            use_videos=True,
         ),
         aggregate_pipeline_dataset_features(
             pipeline=observation,

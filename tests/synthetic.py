@@ -31,7 +31,14 @@ def spec() -> s.EnvironmentSpec:
         environment_state_names=(
             *("ee.x", "ee.y", "ee.z"),
             *(f"ee.r{row}{column}" for column in "yz" for row in "xyz"),
-            *("object.x", "object.y", "object.z", "object.cos4yaw", "object.sin4yaw", "object_from_ee.x"),
+            *(
+                "object.x",
+                "object.y",
+                "object.z",
+                "object.cos4yaw",
+                "object.sin4yaw",
+                "object_from_ee.x",
+            ),
         ),
         sim_state_size=7,
         instruction="Lift the cube, 100 %.",

@@ -19,9 +19,15 @@ from manip_il.learn.network import read_weights
 from manip_il.robots.files import ModelFiles
 
 
-@pytest.mark.parametrize("value", ["", ".", "..", ".hidden", "a..b", "../a", "a\\b", "a\n", "a\0", "~", "é", "a" * 101])
+@pytest.mark.parametrize(
+    "value", ["", ".", "..", ".hidden", "a..b", "../a", "a\\b", "a\n", "a\0", "~", "é", "a" * 101]
+)
 def test_names_that_could_leave_a_folder_are_refused(value):
-    for check, refused in ((checks.name, value), (checks.name, "a/b"), (checks.repo_id, f"a/{value}")):
+    for check, refused in (
+        (checks.name, value),
+        (checks.name, "a/b"),
+        (checks.repo_id, f"a/{value}"),
+    ):
         with pytest.raises(ManipError, match="camera is"):
             check("camera", refused)
     with pytest.raises(ManipError):
@@ -69,7 +75,9 @@ def hide(path: Path, kind: str) -> None:
         lambda path: File.of(path),
     ],
 )
-def test_what_is_not_a_regular_file_is_refused_in_a_line_by_every_reader(read, kind: str, tmp_path: Path):
+def test_what_is_not_a_regular_file_is_refused_in_a_line_by_every_reader(
+    read, kind: str, tmp_path: Path
+):
     hide(tmp_path / "x", kind)
     with pytest.raises(ManipError, match=r"cannot read .*/x: it is not a regular file") as error:
         read(tmp_path / "x")
@@ -90,18 +98,26 @@ def test_so_are_a_models_included_files_and_a_policys_weights(kind: str, tmp_pat
 
 def test_yaml_is_bounded_in_what_it_expands_to_and_holds_unicode(tmp_path: Path):
     rows = ["a: &a [x, x, x, x, x, x, x, x, x]"]
-    rows += [f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]" for before, name in pairwise("abcdefghi")]
+    rows += [
+        f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]"
+        for before, name in pairwise("abcdefghi")
+    ]
     for text in ("\n".join(rows), "&a [*a]", "&a {k: *a}"):
         with pytest.raises(ValueError, match="more than 100,000 values"):
             checks.parse_yaml(text)
-    assert checks.parse_yaml("a: &a {k: 1}\nb: {<<: *a, l: [*a, *a]}")["b"] == {"k": 1, "l": [{"k": 1}] * 2}
+    assert checks.parse_yaml("a: &a {k: 1}\nb: {<<: *a, l: [*a, *a]}")["b"] == {
+        "k": 1,
+        "l": [{"k": 1}] * 2,
+    }
     with pytest.raises(ValueError, match="surrogates not allowed"):
         checks.parse_yaml('names: ["\\ud800"]')
     with pytest.raises(ManipError, match="in Unicode"):
         checks.text("task", "\ud800")
 
 
-@pytest.mark.parametrize("text", ["a: !!python/object/apply:os.getcwd []", "2001-99-99", "a: [", "\0", b"a: \xff"])
+@pytest.mark.parametrize(
+    "text", ["a: !!python/object/apply:os.getcwd []", "2001-99-99", "a: [", "\0", b"a: \xff"]
+)
 def test_what_is_no_sound_yaml_is_refused_in_a_line(tmp_path: Path, text: str | bytes):
     path = tmp_path / "c.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())

@@ -9,7 +9,9 @@ from manip_il.evaluation.tables import Table
 
 
 def test_a_near_name_is_offered_and_all_are_listed():
-    near, far = (str(UnknownName("robot", name, ["panda", "fetch"])) for name in ("pnada", "xylophone"))
+    near, far = (
+        str(UnknownName("robot", name, ["panda", "fetch"])) for name in ("pnada", "xylophone")
+    )
     assert near == "unknown robot 'pnada' (did you mean 'panda'?); known: fetch, panda"
     assert far == "unknown robot 'xylophone'; known: fetch, panda"
     assert nearest("lfit", iter(["reach", "lift"])) == " (did you mean 'lift'?)"
@@ -26,7 +28,9 @@ def test_no_control_character_of_a_name_reaches_a_terminal(capsys: pytest.Captur
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-@pytest.mark.parametrize("value", [None, 1.5, "it's", "x" * 150, b"x" * 150, (1,), [], {"a": 1, "b": [{}, ()]}])
+@pytest.mark.parametrize(
+    "value", [None, 1.5, "it's", "x" * 150, b"x" * 150, (1,), [], {"a": 1, "b": [{}, ()]}]
+)
 def test_a_short_value_is_shown_as_python_prints_it(value):
     assert shorten(value) == repr(value)
 

@@ -1,4 +1,6 @@
-"""The repository keeps its own rules: what no file may name, and what is named in several places."""
+"""The repository keeps its own rules: what no file may name, and what is named in several
+places.
+"""
 
 import ast
 import re
@@ -22,14 +24,29 @@ MACHINE_PATH = re.compile(r"(?<![\w./~-])/(?:home|Users|root|work|mnt|data)" + r
 
 def tracked() -> list[Path]:
     """Files that git knows or would add."""
-    command = ["git", "-c", "safe.directory=*", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    command = [
+        "git",
+        "-c",
+        "safe.directory=*",
+        "ls-files",
+        "-z",
+        "--cached",
+        "--others",
+        "--exclude-standard",
+    ]
     listing = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     return [ROOT / name for name in listing.split("\0") if name and (ROOT / name).is_file()]
 
 
 def found(pattern: re.Pattern[str]) -> list[tuple[str, str]]:
-    """Files that name something, and what; not pictures and other binaries, as far as they are no text."""
-    texts = ((path.relative_to(ROOT), path.read_text(encoding="utf-8", errors="ignore")) for path in tracked())
+    """Files that name something, and what.
+
+    Not pictures and other binaries, as far as they are no text.
+    """
+    texts = (
+        (path.relative_to(ROOT), path.read_text(encoding="utf-8", errors="ignore"))
+        for path in tracked()
+    )
     return [(str(path), match.group()) for path, text in texts if (match := pattern.search(text))]
 
 
@@ -48,9 +65,17 @@ def test_what_the_settings_of_the_tests_name_is_there():
 def test_every_file_that_the_package_reads_is_installed_in_it():
     """Not beside it, where it is missing after `pip install --target` or `--user`."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    folders = {ROOT.joinpath(*name.split(".")): globs for name, globs in settings["package-data"].items()}
-    installed = {path for folder, globs in folders.items() for one in globs for path in folder.glob(one)}
-    read = {path for path in tracked() if path.is_relative_to(ROOT / "manip_il") and path.suffix != ".py"}
+    folders = {
+        ROOT.joinpath(*name.split(".")): globs for name, globs in settings["package-data"].items()
+    }
+    installed = {
+        path for folder, globs in folders.items() for one in globs for path in folder.glob(one)
+    }
+    read = {
+        path
+        for path in tracked()
+        if path.is_relative_to(ROOT / "manip_il") and path.suffix != ".py"
+    }
     assert "data-files" not in settings
     assert read - installed == set()
 
@@ -61,7 +86,9 @@ def test_the_image_and_make_bring_the_packages_that_errors_name():
 
 
 def calls(*names: str) -> set[tuple[str, str, str]]:
-    """File, function and callee of every call in the package of functions with these names, or methods `.names`."""
+    """File, function and callee of every call in the package of functions with these names, or
+    methods `.names`.
+    """
     found = set[tuple[str, str, str]]()
     for path in sorted((ROOT / "manip_il").rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
@@ -75,13 +102,25 @@ def calls(*names: str) -> set[tuple[str, str, str]]:
 
 
 def test_one_function_runs_a_users_file_and_one_place_calls_it():
-    files = (".exec_module", ".spec_from_file_location", ".run_path", ".run_module", "exec", "__import__", "execfile")
-    assert {(file, function) for file, function, _ in calls(*files)} == {("tasks/table.py", "_of_file")}
+    files = (
+        ".exec_module",
+        ".spec_from_file_location",
+        ".run_path",
+        ".run_module",
+        "exec",
+        "__import__",
+        "execfile",
+    )
+    assert {(file, function) for file, function, _ in calls(*files)} == {
+        ("tasks/table.py", "_of_file")
+    }
     assert calls("_of_file") == {("tasks/table.py", "get_task", "_of_file")}
 
 
 def test_other_code_is_found_by_the_packages_own_tables_alone():
-    assert {(file, function) for file, function, _ in calls("import_module", ".import_module", "eval")} == {
+    assert {
+        (file, function) for file, function, _ in calls("import_module", ".import_module", "eval")
+    } == {
         ("__init__.py", "__getattr__"),
         ("algorithms/run.py", "results"),
         ("cli/main.py", "load"),

@@ -17,7 +17,9 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
     st.integers(0, 10_000),
     st.booleans(),
 )
-def test_a_state_survives_its_vector_bit_for_bit(physics, variation, step: int, streak: int, ever: bool):
+def test_a_state_survives_its_vector_bit_for_bit(
+    physics, variation, step: int, streak: int, ever: bool
+):
     state = State(physics, variation, step, streak, ever)
     vector = state.to_vector()
     assert (vector.dtype, len(vector)) == (np.float64, len(physics) + len(variation) + STATE_EXTRAS)
@@ -39,10 +41,19 @@ def test_a_state_from_a_vector_owns_its_numbers():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda bad: State(np.array([0.0, 0.0, bad]), np.zeros(3)), r"State\.physics: .* at index 2"),
-        (lambda bad: State(np.zeros(4), np.array([0.0, bad, 0.0])), r"State\.variation: .* at index 1"),
+        (
+            lambda bad: State(np.array([0.0, 0.0, bad]), np.zeros(3)),
+            r"State\.physics: .* at index 2",
+        ),
+        (
+            lambda bad: State(np.zeros(4), np.array([0.0, bad, 0.0])),
+            r"State\.variation: .* at index 1",
+        ),
         (lambda bad: Label(np.array([bad]), 1, True, 0.0), r"Label\.action"),
-        (lambda bad: Observation(np.zeros(2, "f4"), np.array([bad], "f4")), r"observation\.environment_state"),
+        (
+            lambda bad: Observation(np.zeros(2, "f4"), np.array([bad], "f4")),
+            r"observation\.environment_state",
+        ),
         (
             lambda bad: Episode(12, {"action": np.array([[0, 0], [0, bad], [0, 0]])}, False, False),
             r"episode 12, action: .* at frame 1 is not finite",

@@ -1,4 +1,6 @@
-"""Files from outside have one door: only `checks.py` opens them, others read what it opened, or are listed here."""
+"""Files from outside have one door: only `checks.py` opens them, others read what it opened, or
+are listed here.
+"""
 
 import ast
 from collections.abc import Iterator
@@ -8,9 +10,32 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "manip_il"
 READERS = {
-    *("open", "os.open", "io.open", "av.open", "Image.open", "np.load", "np.fromfile", "np.loadtxt", "torch.load"),
-    *("pq.ParquetFile", "pq.read_table", "pq.read_schema", "pq.read_metadata", "pd.read_parquet", "pa.OSFile"),
-    *("shutil.copyfile", "load_file", "safe_open", "mujoco.MjSpec.from_file", "mujoco.MjModel.from_xml_path"),
+    *(
+        "open",
+        "os.open",
+        "io.open",
+        "av.open",
+        "Image.open",
+        "np.load",
+        "np.fromfile",
+        "np.loadtxt",
+        "torch.load",
+    ),
+    *(
+        "pq.ParquetFile",
+        "pq.read_table",
+        "pq.read_schema",
+        "pq.read_metadata",
+        "pd.read_parquet",
+        "pa.OSFile",
+    ),
+    *(
+        "shutil.copyfile",
+        "load_file",
+        "safe_open",
+        "mujoco.MjSpec.from_file",
+        "mujoco.MjModel.from_xml_path",
+    ),
 }
 METHODS = {"read_text", "read_bytes"}
 ALLOWED = {
@@ -29,19 +54,27 @@ ALLOWED = {
 
 
 def writes(call: ast.Call) -> bool:
-    modes = [one.value for one in call.args if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+    modes = [
+        one.value
+        for one in call.args
+        if isinstance(one, ast.Constant) and isinstance(one.value, str)
+    ]
     return any(set(mode) & set("wxa") and set(mode) <= set("wxab+") for mode in modes)
 
 
 def raw_reads(tree: ast.Module) -> Iterator[str]:
-    """Calls that open a path to read it, unless `checks` opened it, it is in memory, or it ships with the package."""
+    """Calls that open a path to read it, unless `checks` opened it, it is in memory, or it ships
+    with the package.
+    """
     opened = {
         item.optional_vars.id
         for block in ast.walk(tree)
         if isinstance(block, ast.With)
         for item in block.items
         if isinstance(item.optional_vars, ast.Name)
-        and ast.unparse(item.context_expr).startswith(("checks.native_path", "native_path", "open_outside"))
+        and ast.unparse(item.context_expr).startswith(
+            ("checks.native_path", "native_path", "open_outside")
+        )
     }
     for call in (one for one in ast.walk(tree) if isinstance(one, ast.Call)):
         text, name = ast.unparse(call), ast.unparse(call.func)
@@ -50,7 +83,12 @@ def raw_reads(tree: ast.Module) -> Iterator[str]:
         is_path_open = last == "open" and [*map(ast.unparse, call.args)] in (["'r'"], ["'rb'"])
         if not (name in READERS or is_method or is_path_open) or writes(call):
             continue
-        given = {one.id for argument in call.args for one in ast.walk(argument) if isinstance(one, ast.Name)}
+        given = {
+            one.id
+            for argument in call.args
+            for one in ast.walk(argument)
+            if isinstance(one, ast.Name)
+        }
         if not given & {*opened, "BytesIO"} and "__file__" not in text and "files(" not in text:
             yield text
 
@@ -60,12 +98,22 @@ def test_only_checks_opens_files_from_outside():
         path.relative_to(PACKAGE).as_posix(): [*raw_reads(ast.parse(path.read_text()))]
         for path in PACKAGE.rglob("*.py")
     }
-    assert {name: calls for name, calls in found.items() if calls and name not in {*ALLOWED, "checks.py"}} == {}
+    assert {
+        name: calls
+        for name, calls in found.items()
+        if calls and name not in {*ALLOWED, "checks.py"}
+    } == {}
 
 
 @pytest.mark.parametrize(
     "door",
-    ["path.open('rb')", "path.read_text()", "pq.read_schema(path)", "np.load(path)", "av.open(f'file:{path}')"],
+    [
+        "path.open('rb')",
+        "path.read_text()",
+        "pq.read_schema(path)",
+        "np.load(path)",
+        "av.open(f'file:{path}')",
+    ],
 )
 def test_a_new_door_is_found(door: str):
     assert [*raw_reads(ast.parse(f"with {door} as found:\n    pass"))] == [door]

@@ -31,7 +31,9 @@ def test_a_longer_stream_begins_as_a_shorter_one(stream: str, seed: int, count: 
 
 @pytest.mark.parametrize("seed", [-1, MAX_SEED + 1])
 def test_a_seed_out_of_range_is_refused(seed: int):
-    with pytest.raises(UsageError, match=rf"seed is {seed}; expected a whole number from 0 to {MAX_SEED}"):
+    with pytest.raises(
+        UsageError, match=rf"seed is {seed}; expected a whole number from 0 to {MAX_SEED}"
+    ):
         stream_base("test", seed)
 
 

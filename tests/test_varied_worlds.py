@@ -1,4 +1,6 @@
-"""Worlds that vary: every draw is in the state and in the episode, labels and steps of a restored state are its own."""
+"""Worlds that vary: every draw is in the state and in the episode, labels and steps of a
+restored state are its own.
+"""
 
 from pathlib import Path
 
@@ -31,7 +33,9 @@ REACH = make_config("panda", "reach", horizon=6, success_steps=1)
 
 
 def condition(env: EnvConfig, *kinds: str) -> Condition:
-    [found] = varied([kind for kind in kinds if kind != "object" or env.task != "reach"], env, sees=True)
+    [found] = varied(
+        [kind for kind in kinds if kind != "object" or env.task != "reach"], env, sees=True
+    )
     return found
 
 
@@ -46,7 +50,9 @@ def path_of(env: ManipEnv, state: State, steps: int) -> list[bytes]:
     return path
 
 
-@pytest.mark.parametrize(("robot", "task", "shape"), [*((*scene, "") for scene in SCENES), ("panda", "lift", "any")])
+@pytest.mark.parametrize(
+    ("robot", "task", "shape"), [*((*scene, "") for scene in SCENES), ("panda", "lift", "any")]
+)
 def test_a_restored_state_is_the_same_world_with_the_same_labels(robot: str, task: str, shape: str):
     config = make_config(robot, task, object=shape)
     env = env_of(config, None, [condition(config, *KINDS)])
@@ -58,13 +64,18 @@ def test_a_restored_state_is_the_same_world_with_the_same_labels(robot: str, tas
     plain.start(8)
     restored = State.from_vector(vector)
     assert path_of(plain, restored, 4) == path_of(env, State.from_vector(vector), 4)
-    np.testing.assert_array_equal(plain.get_state().variation, with_drawn(plain.scene.nominal, env.drawn))
+    np.testing.assert_array_equal(
+        plain.get_state().variation, with_drawn(plain.scene.nominal, env.drawn)
+    )
 
 
 @pytest.mark.gl
 @pytest.mark.parametrize("shape", ["", "any"])
 def test_pictures_of_restored_states_are_those_of_their_own_world(shape: str):
-    config, cameras = make_config("panda", "pick_place", object=shape), CameraConfig(("front", "wrist"), 32, 32)
+    config, cameras = (
+        make_config("panda", "pick_place", object=shape),
+        CameraConfig(("front", "wrist"), 32, 32),
+    )
     env, plain = env_of(config, cameras, [condition(config, *KINDS)]), env_of(config, cameras)
     plain.start(2)
     before = plain.observe().images["front"]
@@ -98,9 +109,13 @@ def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(
         path = Journal(tmp_path / "varied.journals", spec, fingerprint).write(episode)
         assert read_journal(path)[1].drawn == episode.drawn != {}
         state = State.from_vector(episode.columns[schema.SIM_STATE][0])
-        np.testing.assert_array_equal(state.variation, with_drawn(env_of(config).scene.nominal, episode.drawn))
+        np.testing.assert_array_equal(
+            state.variation, with_drawn(env_of(config).scene.nominal, episode.drawn)
+        )
     build(tmp_path / "varied.journals", tmp_path / "varied")
-    assert [one.drawn for one in read_episodes(tmp_path / "varied")] == [one.drawn for one in episodes]
+    assert [one.drawn for one in read_episodes(tmp_path / "varied")] == [
+        one.drawn for one in episodes
+    ]
     assert examine_folder(tmp_path / "varied") == []
 
 

@@ -1,4 +1,6 @@
-"""Commands in forks of a process that has imported LeRobot, so that not every one of them takes seconds to start."""
+"""Commands in forks of a process that has imported LeRobot, so that not every one of them takes
+seconds to start.
+"""
 
 import json
 import subprocess
@@ -11,20 +13,33 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 class Warm(AbstractContextManager["Warm"]):
-    """The process starts when it is first needed. home: its own. imported: modules of ours that it has imported too."""
+    """The process starts when it is first needed. home: its own. imported: modules of ours that
+    it has imported too.
+    """
 
-    def __init__(self, environment: Mapping[str, str], home: Path, imported: Sequence[str] = ()) -> None:
+    def __init__(
+        self, environment: Mapping[str, str], home: Path, imported: Sequence[str] = ()
+    ) -> None:
         self._environment, self._home, self._imported = environment, home, imported
         self._process: subprocess.Popen[str] | None = None
 
     def run(self, *words: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
         """A command as in a shell. `python` runs a file, or code behind `-c`."""
         if self._process is None:
-            child = [sys.executable, str(Path(__file__).with_name("warm_child.py")), *self._imported]
+            child = [
+                sys.executable,
+                str(Path(__file__).with_name("warm_child.py")),
+                *self._imported,
+            ]
             folders = {"HOME": "", "HF_HOME": "hf", "HF_LEROBOT_HOME": "hf/lerobot"}
-            environment = {**self._environment, **{name: str(self._home / path) for name, path in folders.items()}}
+            environment = {
+                **self._environment,
+                **{name: str(self._home / path) for name, path in folders.items()},
+            }
             pipe = subprocess.PIPE
-            self._process = subprocess.Popen(child, env=environment, stdin=pipe, stdout=pipe, text=True, cwd=ROOT)
+            self._process = subprocess.Popen(
+                child, env=environment, stdin=pipe, stdout=pipe, text=True, cwd=ROOT
+            )
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         line, out, err = [str(word) for word in words], self._home / "out", self._home / "err"

@@ -1,7 +1,10 @@
-"""A process that has imported torch, LeRobot and its commands; every command runs in a fork of it, at once.
+"""A process that has imported torch, LeRobot and its commands.
 
-Nothing of this project is imported unless named on the command line: LeRobot must find it by itself. One JSON object a
-line comes in, `{"words", "folder", "out", "err"}`, the words those of a shell; the exit code goes out.
+Every command runs in a fork of it, at once.
+
+Nothing of this project is imported unless named on the command line: LeRobot must find it by
+itself. One JSON object a line comes in, `{"words", "folder", "out", "err"}`, the words those of a
+shell; the exit code goes out.
 """
 
 import atexit
@@ -28,7 +31,9 @@ LEROBOT = (
 
 
 def become(words: list[str], folder: str, out: str, err: str) -> NoReturn:
-    """Run the command and end as Python does, but for taking everything apart, which takes longer than to start."""
+    """Run the command and end as Python does, but for taking everything apart, which takes
+    longer than to start.
+    """
     code = 1
     try:
         work(words, folder, out, err)

@@ -1,4 +1,7 @@
-"""Behaviour cloning: fit a policy to the expert's own demonstrations; every round adds demonstrations."""
+"""Behaviour cloning: fit a policy to the expert's own demonstrations.
+
+Every round adds demonstrations.
+"""
 
 from collections.abc import Iterator
 

@@ -21,10 +21,13 @@ if TYPE_CHECKING:  # so that `manip-il dagger --help` does not import numpy
 
 @dataclass(frozen=True)
 class BetaSchedule:
-    """A schedule `kind:parameter` of beta, the share of steps that the expert drives. In round 0 beta is 1.
+    """A schedule `kind:parameter` of beta, the share of steps that the expert drives.
 
-    `constant:0` lets the learner drive alone from round 1 on (the paper's parameter-free choice), `linear:5` falls
-    linearly from 1 in round 0 to 0 in round 5, `exponential:0.5` is 0.5 to the power of the round.
+    In round 0 beta is 1.
+
+    `constant:0` lets the learner drive alone from round 1 on (the paper's parameter-free choice),
+    `linear:5` falls linearly from 1 in round 0 to 0 in round 5, `exponential:0.5` is 0.5 to the
+    power of the round.
     """
 
     kind: str
@@ -38,8 +41,14 @@ class BetaSchedule:
             number = float(parameter)
         except ValueError:
             number = math.nan
-        if not ((kind == "linear" and number >= 1) or (kind in ("constant", "exponential") and 0 <= number <= 1)):
-            kinds = "constant:B, linear:ROUNDS or exponential:B, with B from 0 to 1 and at least 1 round"
+        if not (
+            (kind == "linear" and number >= 1)
+            or (kind in ("constant", "exponential") and 0 <= number <= 1)
+        ):
+            kinds = (
+                "constant:B, linear:ROUNDS or exponential:B, with B from 0 to 1 and at least 1"
+                " round"
+            )
             raise UsageError(f"beta is {text!r}; expected {kinds}")
         return cls(kind, number)
 
@@ -57,8 +66,10 @@ class BetaSchedule:
         return self.parameter**round_
 
 
-ALGORITHMS = {"dagger": "DAgger", "cloning": "Cloning", "dart": "DART"}  # each key names a module and its function
-EXPERT_DRIVES = ("cloning", "dart")  # only the expert drives, so label, query and beta have no effect
+# each key names a module and its function
+ALGORITHMS = {"dagger": "DAgger", "cloning": "Cloning", "dart": "DART"}
+# only the expert drives, so label, query and beta have no effect
+EXPERT_DRIVES = ("cloning", "dart")
 
 if TYPE_CHECKING:
     Method = str
@@ -71,55 +82,83 @@ _DEFAULTS = ("per_state", None, _LEARNER_ALONE)  # label, query, beta
 
 @dataclass(frozen=True)
 class RunConfig(Seeded):
-    """Options of `manip-il dagger`. Round 0 records the expert's demonstrations unless `datasets` has some.
+    """Options of `manip-il dagger`.
 
-    datasets: recorded demonstrations that replace those of round 0. start: the `pretrained_model` folder of a policy
-    that replaces cloning in round 0; without datasets, round 0 then has no demonstrations. Later rounds start from the
-    policy's weights and keep its architecture.
+    Round 0 records the expert's demonstrations unless `datasets` has some.
 
-    query_rule: None for the label mode's default, see `query`. hold: also applies to validation. patience: ends
-    rollouts that only repeat their states. disturbed_share: the disturbances are `manip_il.sim.events.STANDARD`.
-    cameras: rendered during rollouts or, with `redraw`, only in the redrawn scenes. conditions: variations of the world
-    in rollouts and validation.
+    datasets: recorded demonstrations that replace those of round 0. start: the `pretrained_model`
+    folder of a policy that replaces cloning in round 0; without datasets, round 0 then has no
+    demonstrations. Later rounds start from the policy's weights and keep its architecture.
+
+    query_rule: None for the label mode's default, see `query`. hold: also applies to validation.
+    patience: ends rollouts that only repeat their states. disturbed_share: the disturbances are
+    `manip_il.sim.events.STANDARD`. cameras: rendered during rollouts or, with `redraw`, only in the
+    redrawn scenes. conditions: variations of the world in rollouts and validation.
     """
 
     env: EnvConfig = field(default_factory=make_config)
     method: str = "dagger"
     demonstrations: int = option(50, "successful expert episodes of round 0", at_least=1)
     rounds: int = option(
-        5, "DAgger rounds after round 0; may be raised when a run is resumed", at_least=0, at_most=99, grows=True
+        5,
+        "DAgger rounds after round 0; may be raised when a run is resumed",
+        at_least=0,
+        at_most=99,
+        grows=True,
     )
-    episodes_per_round: int = option(50, "rollouts per round, or demonstrations with --method=cloning", at_least=1)
-    label_budget: int | None = option(None, "total number of expert labels at which the run ends", at_least=1)
+    episodes_per_round: int = option(
+        50, "rollouts per round, or demonstrations with --method=cloning", at_least=1
+    )
+    label_budget: int | None = option(
+        None, "total number of expert labels at which the run ends", at_least=1
+    )
     beta: BetaSchedule = option(
-        lambda: _LEARNER_ALONE, "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B"
+        lambda: _LEARNER_ALONE,
+        "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B",
     )
     label: Literal["per_state", "takeover", "branch"] = option(
         "per_state",
-        "what the expert gives if queried: one action, a drive to the end, or a branch (docs/dagger.md)",
+        "what the expert gives if queried: one action, a drive to the end, or a branch"
+        " (docs/dagger.md)",
     )
     query_rule: Query | None = None
     branch_steps: int | None = option(
-        None, "control steps of a branch; by default just enough for one whole action chunk", at_least=1
+        None,
+        "control steps of a branch; by default just enough for one whole action chunk",
+        at_least=1,
     )
-    ensemble: int = option(1, "policies fitted per round, for --query=ensemble:BOUND; the first one drives", at_least=1)
-    refit: Literal["scratch", "warm"] = option("scratch", "each round's initial weights: random or the last round's")
+    ensemble: int = option(
+        1, "policies fitted per round, for --query=ensemble:BOUND; the first one drives", at_least=1
+    )
+    refit: Literal["scratch", "warm"] = option(
+        "scratch", "each round's initial weights: random or the last round's"
+    )
     refit_steps: int | None = option(
-        None, "gradient steps in later rounds, with --refit=warm; by default as many as in round 0", at_least=1
+        None,
+        "gradient steps in later rounds, with --refit=warm; by default as many as in round 0",
+        at_least=1,
     )
     fit: FitConfig = field(default_factory=FitConfig)
-    validation_episodes: int = option(200, "unseen episodes by which the best round is chosen", at_least=1)
+    validation_episodes: int = option(
+        200, "unseen episodes by which the best round is chosen", at_least=1
+    )
     hold: int = option(10, "control steps of a rollout after success", at_least=0)
     patience: int = option(
-        100, "control steps without progress after which a rollout ends, if every state gets a label", at_least=1
+        100,
+        "control steps without progress after which a rollout ends, if every state gets a label",
+        at_least=1,
     )
     disturbed_share: float = option(
-        0.5, "share of a round's rollouts with disturbances: knocked object, noisy actions", at_least=0, at_most=1
+        0.5,
+        "share of a round's rollouts with disturbances: knocked object, noisy actions",
+        at_least=0,
+        at_most=1,
     )
     cameras: CameraConfig | None = None
     redraw: int = option(
         0,
-        "number of scenes redrawn from round 0's states, for picture policies; later rounds get as many per state",
+        "number of scenes redrawn from round 0's states, for picture policies; later rounds get as"
+        " many per state",
         at_least=0,
     )
     conditions: tuple[Condition, ...] = ()
@@ -135,49 +174,76 @@ class RunConfig(Seeded):
         if self.method not in ALGORITHMS:
             raise UnknownName("method", self.method, ALGORITHMS)
         if self.method in EXPERT_DRIVES and (self.label, self.query_rule, self.beta) != _DEFAULTS:
-            raise UsageError(f"only the expert drives in {self.method!r}; leave out label, query and beta")
+            raise UsageError(
+                f"only the expert drives in {self.method!r}; leave out label, query and beta"
+            )
         if self.fit.takes_images and self.cameras is None:
-            raise UsageError("the policy takes images, but none are rendered; give --cameras=front,side,wrist")
+            raise UsageError(
+                "the policy takes images, but none are rendered; give --cameras=front,side,wrist"
+            )
         if self.cameras is not None and not self.fit.takes_images:
-            raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation")
+            raise UsageError(
+                "images are rendered, but the policy takes none; leave out --cameras or"
+                " --observation"
+            )
         if self.method == "dart" and self.cameras is not None:
-            raise UsageError("method 'dart' measures the learner's errors on state vectors; it does not support images")
+            raise UsageError(
+                "method 'dart' measures the learner's errors on state vectors; it does not support"
+                " images"
+            )
         self._check_queries()
 
     def _check_queries(self) -> None:
         rule = self.query_rule
         if self.label == "takeover" and self.beta != _LEARNER_ALONE:
-            raise UsageError(f"beta is '{self.beta}', but label 'takeover' starts with the learner alone; omit beta")
+            raise UsageError(
+                f"beta is '{self.beta}', but label 'takeover' starts with the learner alone; omit"
+                " beta"
+            )
         if self.start is not None and self.ensemble > 1:
-            raise UsageError(f"ensemble is {self.ensemble}, but --policy.path gives one policy; expected 1")
+            raise UsageError(
+                f"ensemble is {self.ensemble}, but --policy.path gives one policy; expected 1"
+            )
         if (rule is not None and rule.kind == "ensemble") != (self.ensemble > 1):
             raise UsageError(
-                f"ensemble is {self.ensemble} with query={rule or 'every'}; expected 2 or more with "
-                "query=ensemble:BOUND, else 1"
+                f"ensemble is {self.ensemble} with query={rule or 'every'}; expected 2 or more with"
+                " query=ensemble:BOUND, else 1"
             )
 
     @property
     def steps_of_branch(self) -> int:
-        """Control steps that the expert drives in a branch; by default just enough for one whole action chunk."""
+        """Control steps that the expert drives in a branch.
+
+        By default just enough for one whole action chunk.
+        """
         return self.branch_steps or sum(plan_of(self.fit))
 
     @property
     def query(self) -> Query:
-        """The rule that decides when the expert is queried; by default it depends on the label mode.
+        """The rule that decides when the expert is queried.
 
-        `per_state`: in every state; `takeover`: once; `branch`: at random, for about one label per step.
+        By default it depends on the label mode.
+
+        `per_state`: in every state; `takeover`: once; `branch`: at random, for about one label per
+        step.
         """
         from manip_il.collect.query import Query
 
         if self.query_rule is not None or self.label == "per_state":
             return self.query_rule or Query()
-        return Query("one") if self.label == "takeover" else Query("probability", 1 / self.steps_of_branch)
+        return (
+            Query("one")
+            if self.label == "takeover"
+            else Query("probability", 1 / self.steps_of_branch)
+        )
 
 
 def plan_of(fit: FitConfig) -> tuple[int, int]:
-    """Return how many actions a policy plans at once, and how many frames at an episode's end its fit skips.
+    """Return how many actions a policy plans at once, and how many frames at an episode's end its
+    fit skips.
 
-    Raises what `lerobot_options` raises, and imports LeRobot, as that constructs its configurations.
+    Raises what `lerobot_options` raises, and imports LeRobot, as that constructs its
+    configurations.
     """
     from manip_il.learn.lerobot_config import lerobot_options
 
@@ -186,16 +252,18 @@ def plan_of(fit: FitConfig) -> tuple[int, int]:
 
 
 def check_labels(config: RunConfig) -> None:
-    """Raise `UsageError` for labels that the policy cannot learn from, or for invalid LeRobot options."""
+    """Raise `UsageError` for labels that the policy cannot learn from, or for invalid LeRobot
+    options.
+    """
     plan, dropped = plan_of(config.fit)
     name, rule = config.fit.kind, config.query
     if config.label == "per_state" and plan > 1 and rule.kind != "every":
         raise UsageError(
-            f"query={rule} with label=per_state gives single labels, but {name} learns from {plan} in a row; "
-            "use label=branch or label=takeover"
+            f"query={rule} with label=per_state gives single labels, but {name} learns from {plan}"
+            " in a row; use label=branch or label=takeover"
         )
     if config.label == "branch" and config.steps_of_branch <= dropped:
         raise UsageError(
-            f"branch_steps is {config.steps_of_branch}, but {name} ignores the last {dropped} frames of "
-            "every episode; give more, or --policy.drop_n_last_frames=0"
+            f"branch_steps is {config.steps_of_branch}, but {name} ignores the last {dropped}"
+            " frames of every episode; give more, or --policy.drop_n_last_frames=0"
         )

@@ -1,4 +1,6 @@
-"""DART: demonstrations under noise that resembles the learner's errors (Laskey et al., CoRL 2017)."""
+"""DART: demonstrations under noise that resembles the learner's errors (Laskey et al., CoRL
+2017).
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +19,9 @@ from manip_il.learn.policy import LearnedPolicy, actions_along
 
 
 def dart(run: Run, c: RunConfig) -> Iterator[Result]:
-    """Yield each round's result: demonstrate under noise like the learner's errors, aggregate, refit, validate."""
+    """Yield each round's result: demonstrate under noise like the learner's errors, aggregate,
+    refit, validate.
+    """
     data = [run.demonstrations(c.demonstrations)]
     policy = run.fit(data)
     yield run.validate(policy)
@@ -29,15 +33,21 @@ def dart(run: Run, c: RunConfig) -> Iterator[Result]:
 
 
 def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> tuple[tuple[float, ...], ...]:
-    """Return the noise of the next round: the covariance (n, n) of the learner's errors on an expert's dataset.
+    """Return the noise of the next round: the covariance (n, n) of the learner's errors on an
+    expert's dataset.
 
-    The noise is the maximum likelihood fit of a Gaussian with mean zero, as in the paper. Use data that the policy was
-    not fitted to, or its errors are underestimated. trust: see `LearnedPolicy.load`. Raises `ManipError` if there is no
-    valid label.
+    The noise is the maximum likelihood fit of a Gaussian with mean zero, as in the paper. Use data
+    that the policy was not fitted to, or its errors are underestimated. trust: see
+    `LearnedPolicy.load`. Raises `ManipError` if there is no valid label.
     """
-    table = Dataset.open(root).columns((STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE_INDEX))
+    table = Dataset.open(root).columns(
+        (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE_INDEX)
+    )
     learner, valid = LearnedPolicy.load(policy, trust=trust), table[LABEL_VALID].reshape(-1) != 0
-    errors = [(actions - table[ACTION][rows])[valid[rows]] for rows, actions in actions_along(learner, table)]
+    errors = [
+        (actions - table[ACTION][rows])[valid[rows]]
+        for rows, actions in actions_along(learner, table)
+    ]
     off = np.concatenate(errors)
     if not len(off):
         raise ManipError(f"{root} has no valid label to compare the policy with")

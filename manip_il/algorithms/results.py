@@ -41,11 +41,13 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Result:
-    """One finished round of imitation, or iteration of reinforcement learning; iteration 0 is the initial policy.
+    """One finished round of imitation, or iteration of reinforcement learning.
 
-    steps, episodes: simulated so far. metrics: of the method, such as `labels`, the valid labels learnt from so far.
-    policy: the checkpoint. validated: None if no validation was due. seconds: by stage; 0 for stages that were already
-    on disk.
+    Iteration 0 is the initial policy.
+
+    steps, episodes: simulated so far. metrics: of the method, such as `labels`, the valid labels
+    learnt from so far. policy: the checkpoint. validated: None if no validation was due. seconds:
+    by stage; 0 for stages that were already on disk.
     """
 
     unit: Literal["round", "iteration"]
@@ -85,13 +87,19 @@ class Result:
 
 
 def best_result(results: Iterable[Result]) -> Result:
-    """Return the result with the highest validation success; on a tie the latest, which has seen the most data."""
+    """Return the result with the highest validation success.
+
+    On a tie the latest, which has seen the most data.
+    """
     return max(results, key=lambda result: (result.validation.success.rate, result.number))
 
 
 def validations(folder: Path) -> dict[int, EvalResult]:
     """Return the validations of a reinforcement learning run, in order, by iteration."""
-    return {int(path.parent.name): EvalResult.read(path) for path in sorted(folder.glob(f"{VALIDATION}/*/{FILE_NAME}"))}
+    return {
+        int(path.parent.name): EvalResult.read(path)
+        for path in sorted(folder.glob(f"{VALIDATION}/*/{FILE_NAME}"))
+    }
 
 
 def best_validation(found: Mapping[int, EvalResult]) -> int:
@@ -114,17 +122,25 @@ def validation_report(
     labels = {one["round"]: one["labels"] for one in records if "round" in one}
     names = {number: f"{runs[0].unit} {number}" for number in found} | {0: first}
     sides = {
-        number: Side.of(names[number], result, labels=labels.get(number), colour=DAGGER if number else CLONING)
+        number: Side.of(
+            names[number], result, labels=labels.get(number), colour=DAGGER if number else CLONING
+        )
         for number, result in found.items()
     }
-    facts = ["The best policy was chosen on these episodes, which overestimate it; measure it with manip-il eval."]
+    facts = [
+        "The best policy was chosen on these episodes, which overestimate it; measure it with"
+        " manip-il eval."
+    ]
     if 0 in found and best:
         facts.insert(0, Comparison(sides[0], sides[best]).verdict)
     return run_report(
-        [sides[number] for number in (labels or sorted({min(found), best, max(found)}))],
+        [sides[number] for number in labels or sorted({min(found), best, max(found)})],
         [Side(title, (Member(Path(title), history=runs),))],
         title=title,
-        verdict=f"Best {names[best]}: validation success {found[best].success} of {found[best].success.n:,} episodes.",
+        verdict=(
+            f"Best {names[best]}: validation success {found[best].success} of"
+            f" {found[best].success.n:,} episodes."
+        ),
         facts=tuple(facts),
         fingerprint=found[best].fingerprint,
     )

@@ -1,8 +1,9 @@
-"""The parts of an imitation round: its rollouts, and the policy that is fitted to the rollouts of all rounds.
+"""The parts of an imitation round: its rollouts, and the policy that is fitted to the rollouts of
+all rounds.
 
 round_003/journals/    every rollout, written as soon as it ends
 round_003/dataset/     the training data; missing if the expert gave no label
-round_003/redrawn/     scenes redrawn from the dataset's states, with --redraw; the policy learns from these
+round_003/redrawn/     scenes redrawn from the dataset's states, with --redraw: what is learnt from
 round_003/policy/      the fit; the other members of an ensemble are policy_1, ...
 round_003/eval.json    the validation
 """
@@ -41,10 +42,11 @@ REDRAWN = "redrawn"
 
 @dataclass(frozen=True)
 class Rollouts:
-    """One round's episodes. dataset: None if the expert gave no label. beta: the expert's share of the steps.
+    """One round's episodes. dataset: None if the expert gave no label. beta: the expert's share of
+    the steps.
 
-    labels: valid labels. queries: states in which the expert was queried. episodes, successes: counts of rollouts.
-    steps: simulated control steps.
+    labels: valid labels. queries: states in which the expert was queried. episodes, successes:
+    counts of rollouts. steps: simulated control steps.
     """
 
     round: int
@@ -59,7 +61,9 @@ class Rollouts:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A round's policy. members: the `pretrained_model` folders of an ensemble; the first one drives.
+    """A round's policy. members: the `pretrained_model` folders of an ensemble.
+
+    The first one drives.
 
     trust: whether to load models that a checkpoint refers to.
     """
@@ -80,7 +84,9 @@ def round_folder(folder: Path, round_: int) -> Path:
 
 
 def mixture(policy: Fitted, beta: float) -> PolicyDriver:
-    """Return a driver: at each step the expert acts with probability beta, else the learner (Ross et al. 2011)."""
+    """Return a driver: at each step the expert acts with probability beta, else the learner
+    (Ross et al. 2011).
+    """
     return PolicyDriver.of(*policy.members, beta=beta, trust=policy.trust)
 
 
@@ -105,7 +111,9 @@ def record_round(
 
 
 def read_rollouts(folder: Path, round_: int, beta: float, *, queried_everywhere: bool) -> Rollouts:
-    """Return a round's rollouts as found on disk. queried_everywhere: whether the expert was queried in every state."""
+    """Return a round's rollouts as found on disk. queried_everywhere: whether the expert was
+    queried in every state.
+    """
     episodes = (read_journal(path)[1] for path in list_episodes(folder / JOURNALS))
     ends = [(len(episode), episode.success) for episode in episodes]
     dataset = folder / DATASET if (folder / DATASET).is_dir() else None
@@ -125,11 +133,15 @@ def given_rollouts(folder: Path, datasets: Sequence[Path]) -> Rollouts:
         sources = {str(one): dataset_sha256(one) for one in datasets}
         merge_datasets(datasets, root, provenance={"given": sources})
     given, labels = Dataset.open(root), _count_labels(root)
-    return Rollouts(0, root, 1.0, labels, labels, given.info.episodes, given.count_successes(), len(given))
+    return Rollouts(
+        0, root, 1.0, labels, labels, given.info.episodes, given.count_successes(), len(given)
+    )
 
 
 def merge_rounds(datasets: Sequence[Path], root: Path, best: int) -> None:
-    """Write all rounds' labels as one dataset, unless it exists. best: number of the best round, for the provenance."""
+    """Write all rounds' labels as one dataset, unless it exists. best: number of the best round,
+    for the provenance.
+    """
 
     def episodes(dataset: Path) -> int:
         return Dataset.open(dataset).info.episodes
@@ -145,16 +157,22 @@ def _count_labels(root: Path) -> int:
 def round_scenes(config: RunConfig, datasets: Sequence[Path]) -> Scenes:
     """Return the scenes to redraw from the states of the last dataset.
 
-    There are as many scenes per state as in round 0. Scene numbers continue from the earlier rounds.
+    There are as many scenes per state as in round 0. Scene numbers continue from the earlier
+    rounds.
     """
     assert config.cameras is not None
     states = [len(Dataset.open(dataset)) for dataset in datasets]
     *before, frames = [max(1, config.redraw * count // states[0]) for count in states]
-    return Scenes(config.cameras, frames, config.seed, conditions=config.conditions, first=sum(before))
+    return Scenes(
+        config.cameras, frames, config.seed, conditions=config.conditions, first=sum(before)
+    )
 
 
 def begin_with(policy: Path, folder: Path) -> Path:
-    """Copy a policy into the folder of a round without training data; return its `pretrained_model`."""
+    """Copy a policy into the folder of a round without training data.
+
+    Return its `pretrained_model`.
+    """
     last = folder / POLICY / "checkpoints" / "last"
     if not last.is_dir():
         with new_folder(last) as new:
@@ -163,9 +181,15 @@ def begin_with(policy: Path, folder: Path) -> Path:
 
 
 def fit_round(
-    roots: Sequence[Path], folder: Path, fit: FitConfig, member: int, on_log: Callable[[dict[str, Any]], None]
+    roots: Sequence[Path],
+    folder: Path,
+    fit: FitConfig,
+    member: int,
+    on_log: Callable[[dict[str, Any]], None],
 ) -> Path:
-    """Fit a round's policy to datasets, or resume the fit; return the checkpoint's `pretrained_model`.
+    """Fit a round's policy to datasets, or resume the fit.
+
+    Return the checkpoint's `pretrained_model`.
 
     member: index in the ensemble. on_log: called with each step's metrics, {} if there are none.
     """
@@ -176,8 +200,8 @@ def fit_round(
 def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0) -> FitConfig:
     """Return the options of one round's fit. init_from: policy from which a warm fit starts.
 
-    If None, the fit starts from the run's start policy, if any. member: index in the ensemble; each member has its own
-    seed.
+    If None, the fit starts from the run's start policy, if any. member: index in the ensemble; each
+    member has its own seed.
     """
     steps = config.fit.steps or (CHUNK_STEPS if config.fit.defaults is LEROBOT else None)
     if init_from is not None:

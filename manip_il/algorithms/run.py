@@ -1,7 +1,7 @@
 """One run of a method in a folder: the steps that the loops of `cloning`, `dart` and `dagger` take.
 
-Every step writes its complete result into the folder, and is skipped if the result exists. So a killed run is resumed
-by running its loop again.
+Every step writes its complete result into the folder, and is skipped if the result exists. So a
+killed run is resumed by running its loop again.
 
     round_003/           see `rounds`
     held_out/            expert demonstrations that no policy learns from
@@ -75,7 +75,9 @@ class Run:
         self._fitted: Fitted | None = None
 
     def results(self) -> Iterator[Result]:
-        """Run or resume the loop of `config.method`, such as `dagger.dagger`, and yield its results."""
+        """Run or resume the loop of `config.method`, such as `dagger.dagger`, and yield its
+        results.
+        """
         name = self.config.method
         loop = getattr(importlib.import_module(f"manip_il.algorithms.{name}"), name)
         return self.follow(loop(self, self.config))
@@ -83,12 +85,14 @@ class Run:
     def follow(self, results: Iterator[Result]) -> Iterator[Result]:
         """Yield the results of a method's loop until the loop ends or the label budget is spent.
 
-        Rounds that were already finished are yielded again. At the end, `dataset` holds the labels of all rounds.
+        Rounds that were already finished are yielded again. At the end, `dataset` holds the labels
+        of all rounds.
         """
         rounds, path = list[Result](), self.folder / METRICS_FILE
         written = {record.get("round", record.get("iteration")) for record in read_lines(path)}
         for result in results:
-            if result.number not in written:  # otherwise an interrupted run has written the line already
+            # otherwise an interrupted run has written the line already
+            if result.number not in written:
                 append_line(path, result.to_json())
             yield result
             if result.unit == "round":
@@ -102,7 +106,10 @@ class Run:
             merge_rounds(made, self.folder / DATASET, best.number)
 
     def demonstrations(self, count: int, round_: int = 0) -> Rollouts:
-        """Record a round with `count` successful expert episodes; in round 0 `config.datasets` may replace them."""
+        """Record a round with `count` successful expert episodes.
+
+        In round 0 `config.datasets` may replace them.
+        """
         here, config = self._folder(round_), self.config
         if round_ == 0 and (config.datasets or config.start):
             with self._clock.timed("collect"):
@@ -114,7 +121,9 @@ class Run:
                 job = expert_job(config, round_)
                 stream = f"round/{round_}" if round_ else "demonstrations"
                 seeds = stream_seeds(stream, MAX_TRIES * count, config.seed)
-                episodes = collect_successes(self._engine, job, seeds, count, here / JOURNALS, self._progress.episode)
+                episodes = collect_successes(
+                    self._engine, job, seeds, count, here / JOURNALS, self._progress.episode
+                )
                 recording = Recording(True, count, provenance(job), labels=self._budget(round_))
                 record_round(here, job, episodes, recording)
             self._made[round_] = read_rollouts(here, round_, beta=1.0, queried_everywhere=True)
@@ -126,18 +135,25 @@ class Run:
         with self._clock.timed("collect"):
             if not root.is_dir():
                 job = replace(expert_job(self.config, 0), cameras=None)
-                episodes = collect(self._engine, job, stream_seeds("held_out", count, self.config.seed), journals)
+                episodes = collect(
+                    self._engine, job, stream_seeds("held_out", count, self.config.seed), journals
+                )
                 recording = Recording(provenance=provenance(job))
                 recording.write(journals)
                 recording.make(episodes, root)
-            self._held_out_steps = sum(len(read_journal(path)[1]) for path in list_episodes(journals))
+            self._held_out_steps = sum(
+                len(read_journal(path)[1]) for path in list_episodes(journals)
+            )
         return root
 
-    def rollouts(self, round_: int, driver: Driver, query: Query | None = None, disturbed: float = 0.0) -> Rollouts:
-        """Record a round's episodes, successful or not, with the expert's labels in the mode `config.label`.
+    def rollouts(
+        self, round_: int, driver: Driver, query: Query | None = None, disturbed: float = 0.0
+    ) -> Rollouts:
+        """Record a round's episodes, successful or not, with the expert's labels in the mode
+        `config.label`.
 
-        query: when the expert is queried; None: in every state. disturbed: share of the episodes that have the
-        disturbances `manip_il.sim.events.STANDARD`.
+        query: when the expert is queried; None: in every state. disturbed: share of the episodes
+        that have the disturbances `manip_il.sim.events.STANDARD`.
         """
         here = self._folder(round_)
         config = self.config
@@ -147,23 +163,40 @@ class Run:
         with self._clock.timed("collect"):
             if not (here / DATASET).is_dir():
                 steps = config.steps_of_branch if config.label == "branch" else 1
-                job = replace(expert_job(config, round_), driver=driver, label=config.label, query=rule)
-                job = replace(job, branch_steps=steps, patience=config.patience if job.labels_all else None)
-                seeds, first = stream_seeds(f"round/{round_}", count, config.seed), round(disturbed * count)
+                job = replace(
+                    expert_job(config, round_), driver=driver, label=config.label, query=rule
+                )
+                job = replace(
+                    job, branch_steps=steps, patience=config.patience if job.labels_all else None
+                )
+                seeds, first = (
+                    stream_seeds(f"round/{round_}", count, config.seed),
+                    round(disturbed * count),
+                )
                 hard = replace(job, conditions=(standard_in(job.conditions),))
                 episodes = itertools.chain(
-                    collect(self._engine, hard, seeds[:first], here / JOURNALS, self._progress.episode),
-                    collect(self._engine, job, seeds[first:], here / JOURNALS, self._progress.episode),
+                    collect(
+                        self._engine, hard, seeds[:first], here / JOURNALS, self._progress.episode
+                    ),
+                    collect(
+                        self._engine, job, seeds[first:], here / JOURNALS, self._progress.episode
+                    ),
                 )
                 left = self._budget(round_)
-                recording = Recording(provenance=provenance(job), only_labelled=not job.labels_all, labels=left)
+                recording = Recording(
+                    provenance=provenance(job), only_labelled=not job.labels_all, labels=left
+                )
                 record_round(here, job, episodes, recording)
             everywhere = config.label == "per_state" and rule.kind in ("every", "safety")
-            self._made[round_] = read_rollouts(here, round_, driver.beta, queried_everywhere=everywhere)
+            self._made[round_] = read_rollouts(
+                here, round_, driver.beta, queried_everywhere=everywhere
+            )
         return self._made[round_]
 
     def fit(self, data: Sequence[Rollouts]) -> Fitted:
-        """Fit the policy, or all members of an ensemble, to `data`, whose last rollouts are of the policy's round."""
+        """Fit the policy, or all members of an ensemble, to `data`, whose last rollouts are of
+        the policy's round.
+        """
         config = self.config
         before = self._fitted
         round_ = data[-1].round
@@ -171,8 +204,12 @@ class Run:
         if config.start is not None and (round_ == 0 or all(one.dataset is None for one in data)):
             members.append(begin_with(config.start, here))
         else:
-            roots = [self._training_dataset(one, one.dataset) for one in data if one.dataset is not None]
-            starts = before.members if before and config.refit == "warm" else (None,) * config.ensemble
+            roots = [
+                self._training_dataset(one, one.dataset) for one in data if one.dataset is not None
+            ]
+            starts = (
+                before.members if before and config.refit == "warm" else (None,) * config.ensemble
+            )
             for member, start in enumerate(starts):
                 name = "fit" if config.ensemble == 1 else f"fit {member + 1} of {config.ensemble}"
                 fit = round_fit(config, start, member)
@@ -187,9 +224,14 @@ class Run:
         round_, config = policy.round, self.config
         self._progress.start(f"round {round_}, validate", config.validation_episodes)
         driver = PolicyDriver.of(policy.path, trust=config.fit.trust)
-        job = RolloutJob(config.env, driver, config.hold, label="last", conditions=config.conditions)
+        job = RolloutJob(
+            config.env, driver, config.hold, label="last", conditions=config.conditions
+        )
         validation = self._evaluate(job, self._folder(round_) / FILE_NAME, f"DAgger round {round_}")
-        here, so_far = self._made[round_], [one for one in self._made.values() if one.round <= round_]
+        here, so_far = (
+            self._made[round_],
+            [one for one in self._made.values() if one.round <= round_],
+        )
         return Result(
             unit="round",
             number=round_,
@@ -198,7 +240,8 @@ class Run:
             metrics={
                 "beta": here.beta,
                 "labels": sum(one.labels for one in so_far),
-                # Exceeds `labels` if a query yields no label to learn from (`safety`, held-out episodes of `dart`).
+                # Exceeds `labels` if a query yields no label to learn from (`safety`, held-out
+                # episodes of `dart`).
                 "queries": sum(one.queries for one in so_far) + self._held_out_steps,
                 "rollout_success": here.successes / max(1, here.episodes),
             },
@@ -208,7 +251,9 @@ class Run:
         )
 
     def _evaluate(self, job: RolloutJob, path: Path, name: str) -> EvalResult:
-        """Evaluate a job on the validation seeds and write `path`, unless it exists. name: stored in the file."""
+        """Evaluate a job on the validation seeds and write `path`, unless it exists. name:
+        stored in the file.
+        """
         with self._clock.timed("validate"):
             if path.is_file():
                 return EvalResult.read(path)
@@ -234,12 +279,18 @@ class Run:
         return max(0, self.config.label_budget - spent)
 
     def _training_dataset(self, rollouts: Rollouts, dataset: Path) -> Path:
-        """The dataset that a round's policy learns from: the recorded one, or scenes redrawn from its states."""
+        """The dataset that a round's policy learns from: the recorded one, or scenes redrawn
+        from its states.
+        """
         root = self._folder(rollouts.round) / REDRAWN
         if not self.config.redraw:
             return dataset
         if not root.is_dir():
-            made = [one.dataset for one in self._made.values() if one.dataset and one.round <= rollouts.round]
+            made = [
+                one.dataset
+                for one in self._made.values()
+                if one.dataset and one.round <= rollouts.round
+            ]
             scenes = round_scenes(self.config, made)
             self._progress.start(f"round {rollouts.round}, redraw", len(scenes.numbers[::CHUNK]))
             workers = min(self._engine.workers or default_workers(), default_workers())

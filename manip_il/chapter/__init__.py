@@ -1,1 +1,3 @@
-"""Methods of the chapter beyond cloning and DAgger: theory, inverse RL, preferences, GAIL, AIRL, PPO."""
+"""Methods of the chapter beyond cloning and DAgger: theory, inverse RL, preferences, GAIL, AIRL,
+PPO.
+"""

@@ -1,10 +1,18 @@
-"""The chapter's other methods in Python, as the course uses them: theory, inverse RL, GAIL, preferences."""
+"""The chapter's other methods in Python, as the course uses them: theory, inverse RL, GAIL,
+preferences.
+"""
 
 from manip_il.chapter.config import LearningConfig
 from manip_il.chapter.inverse import Inverse, Learnt, learn, read_carried
 from manip_il.chapter.learning import LearningRun
 from manip_il.chapter.preferences.fitting import fit_answers
-from manip_il.chapter.preferences.pairs import Teacher, answer_pairs, choose_pairs, join_answers, read_frames
+from manip_il.chapter.preferences.pairs import (
+    Teacher,
+    answer_pairs,
+    choose_pairs,
+    join_answers,
+    read_frames,
+)
 from manip_il.chapter.reward import LearnedReward, shape_for
 from manip_il.chapter.theory.bounds import PROCESSES, curves
 from manip_il.chapter.theory.shift import measure_shift

@@ -1,16 +1,19 @@
-"""Discriminators of adversarial imitation, which tell expert from learner; their output is the reward.
+"""Discriminators of adversarial imitation, which tell expert from learner.
 
-Both learn D = P(expert | transition) by logistic loss. GAIL's is any function of state and action (Ho & Ermon,
-Generative adversarial imitation learning, NeurIPS 2016). AIRL's has the form
+Their output is the reward.
+
+Both learn D = P(expert | transition) by logistic loss. GAIL's is any function of state and action
+(Ho & Ermon, Generative adversarial imitation learning, NeurIPS 2016). AIRL's has the form
 
     D = exp f / (exp f + pi(a | s)),    f(s, a, s') = g(s, a) + gamma h(s') - h(s)
 
-so that at the optimum g is a reward up to shaping (Fu, Luo & Levine, Learning robust rewards with adversarial inverse
-reinforcement learning, ICLR 2018, equations 4 and 7). The reward of both is log D - log(1 - D); AIRL's is f - log pi.
+so that at the optimum g is a reward up to shaping (Fu, Luo & Levine, Learning robust rewards with
+adversarial inverse reinforcement learning, ICLR 2018, equations 4 and 7). The reward of both is log
+D - log(1 - D); AIRL's is f - log pi.
 
-Here, AIRL's pi is divided by exp(-H), where H is its entropy. Otherwise -log pi, whose mean is H, would reward every
-step before the absorbing state but none in it, as no action is sampled there, and f would have to follow every change
-of H.
+Here, AIRL's pi is divided by exp(-H), where H is its entropy. Otherwise -log pi, whose mean is H,
+would reward every step before the absorbing state but none in it, as no action is sampled there,
+and f would have to follow every change of H.
 """
 
 from collections.abc import Sequence
@@ -32,8 +35,9 @@ Batch = tuple[Tensor, ...]  # states (B, e), actions (B, n), next states (B, e),
 class Discriminator(nn.Module):
     """A discriminator, its optimiser and its input scales.
 
-    network: the actor, whose statistics scale the inputs. gamma: discount in AIRL's f; None for GAIL's form.
-    asks_density: whether the logit depends on the learner's log-density of the action, as in AIRL.
+    network: the actor, whose statistics scale the inputs. gamma: discount in AIRL's f; None for
+    GAIL's form. asks_density: whether the logit depends on the learner's log-density of the action,
+    as in AIRL.
     """
 
     mean: Tensor
@@ -41,7 +45,9 @@ class Discriminator(nn.Module):
     clamp: Tensor
     free: Tensor
 
-    def __init__(self, config: DiscriminatorConfig, network: MLPNetwork, gamma: float | None = None) -> None:
+    def __init__(
+        self, config: DiscriminatorConfig, network: MLPNetwork, gamma: float | None = None
+    ) -> None:
         super().__init__()
         self.config, self.asks_density = config, gamma is not None
         for name, value in (("mean", network.input_mean), ("scale", network.input_scale)):
@@ -65,25 +71,42 @@ class Discriminator(nn.Module):
     def reward(self, learner: Transitions, log_probs: F32 | None = None) -> F32:
         """Return the reward of every transition, (N,), clipped to +-10.
 
-        log_probs: the learner's log-density of each action, (N,), if the discriminator `asks_density`.
+        log_probs: the learner's log-density of each action, (N,), if the discriminator
+        `asks_density`.
         """
         with torch.no_grad():
             rewards = self.logits(self._encode(learner, log_probs))
         return rewards.clamp(-LARGEST_REWARD, LARGEST_REWARD).numpy().astype(np.float32)
 
     def fit(
-        self, expert: Transitions, learner: Transitions, log_probs: tuple[F32, F32] | None, rng: np.random.Generator
+        self,
+        expert: Transitions,
+        learner: Transitions,
+        log_probs: tuple[F32, F32] | None,
+        rng: np.random.Generator,
     ) -> dict[str, float]:
-        """Take an iteration's gradient steps; return the mean loss, and the initial accuracies on expert and learner.
+        """Take an iteration's gradient steps.
 
-        log_probs: the log-densities, under the learner's policy, of the expert's and of the learner's actions, (N,)
-        each, if the discriminator `asks_density`.
+        Return the mean loss, and the initial accuracies on expert and learner.
+
+        log_probs: the log-densities, under the learner's policy, of the expert's and of the
+        learner's actions, (N,) each, if the discriminator `asks_density`.
         """
-        data = [self._encode(one, log) for one, log in zip((expert, learner), log_probs or (None, None), strict=True)]
+        data = [
+            self._encode(one, log)
+            for one, log in zip((expert, learner), log_probs or (None, None), strict=True)
+        ]
         with torch.no_grad():
-            right = [(self.logits(data[0]) > 0).float().mean().item(), (self.logits(data[1]) < 0).float().mean().item()]
+            right = [
+                (self.logits(data[0]) > 0).float().mean().item(),
+                (self.logits(data[1]) < 0).float().mean().item(),
+            ]
         losses = [self._step(data, rng) for _ in range(self.config.steps)]
-        return {"loss": float(np.mean(losses)), "accuracy_expert": right[0], "accuracy_learner": right[1]}
+        return {
+            "loss": float(np.mean(losses)),
+            "accuracy_expert": right[0],
+            "accuracy_learner": right[1],
+        }
 
     def _step(self, data: Sequence[Batch], rng: np.random.Generator) -> float:
         expert, learner = (_drawn(one, self.config.batch_size, rng) for one in data)
@@ -99,17 +122,25 @@ class Discriminator(nn.Module):
         return loss.item()
 
     def _gradient_penalty(self, expert: Batch, learner: Batch, rng: np.random.Generator) -> Tensor:
-        """Return the mean (|gradient of logit| - 1)^2 at random points between the batches (Gulrajani et al. 2017)."""
+        """Return the mean (|gradient of logit| - 1)^2 at random points between the batches
+        (Gulrajani et al. 2017).
+        """
         share = torch.from_numpy(rng.random((len(expert[0]), 1), dtype=np.float32))
         mixed = tuple(a * share + b * (1 - share) for a, b in zip(expert, learner, strict=True))
         inputs = [one.requires_grad_() for one in mixed[:3]]
-        found = torch.autograd.grad(self.logits(mixed).sum(), inputs, create_graph=True, allow_unused=True)
+        found = torch.autograd.grad(
+            self.logits(mixed).sum(), inputs, create_graph=True, allow_unused=True
+        )
         gradients = torch.cat([one for one in found if one is not None], dim=1)
         return (gradients.norm(dim=1) - 1.0).square().mean()
 
     def _encode(self, rows: Transitions, log_probs: F32 | None) -> Batch:
         log_prob = torch.zeros(len(rows)) if log_probs is None else torch.from_numpy(log_probs)
-        actions = torch.from_numpy(rows.actions) * self.free * (1.0 - torch.from_numpy(rows.states[:, -1:]))
+        actions = (
+            torch.from_numpy(rows.actions)
+            * self.free
+            * (1.0 - torch.from_numpy(rows.states[:, -1:]))
+        )
         return self._state(rows.states), actions, self._state(rows.next_states), log_prob[:, None]
 
     def _state(self, states: F32) -> Tensor:

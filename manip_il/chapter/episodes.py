@@ -1,4 +1,5 @@
-"""Episodes of equal length: those that the learner runs in lockstep, and the demonstrations padded like them.
+"""Episodes of equal length: those that the learner runs in lockstep, and the demonstrations padded
+like them.
 
 Learning needs episodes of equal length H: if an episode that succeeds ends early, a reward that is
 positive (or negative) everywhere rewards (or punishes) staying alive, whatever was demonstrated
@@ -60,9 +61,11 @@ class Transitions:
 
 @dataclass(frozen=True, eq=False)
 class Demonstrations:
-    """Whole episodes of the expert: raw inputs (T, d) and targets (T, n) of each, in a policy's action space.
+    """Whole episodes of the expert: raw inputs (T, d) and targets (T, n) of each, in a policy's
+    action space.
 
-    hold: steps from success to the end; None for episodes that do not end, as in a benchmark's environments.
+    hold: steps from success to the end; None for episodes that do not end, as in a benchmark's
+    environments.
     """
 
     inputs: tuple[F32, ...]
@@ -82,11 +85,13 @@ class Demonstrations:
     def padded(self, steps: int, encode: Callable[[F32], F32]) -> Transitions:
         """Return all episodes, each padded to `steps` transitions, or not padded if `hold` is None.
 
-        encode: normalises raw targets (T, n). Raises `UsageError` if an episode is longer than `steps`.
+        encode: normalises raw targets (T, n). Raises `UsageError` if an episode is longer than
+        `steps`.
         """
         if self.longest > steps:
             raise UsageError(
-                f"episode_steps is {steps}; expected at least {self.longest}, the steps of the longest demonstration"
+                f"episode_steps is {steps}; expected at least {self.longest}, the steps of the"
+                " longest demonstration"
             )
         made = list[tuple[F32, F32, F32]]()
         for inputs, targets in zip(self.inputs, self.targets, strict=True):
@@ -101,10 +106,12 @@ class Demonstrations:
 def read_demonstrations(
     roots: Sequence[Path], encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 ) -> Demonstrations:
-    """Read the expert's whole episodes from datasets. encode: `Conversion.encode` for actions (T, n), states (T, n).
+    """Read the expert's whole episodes from datasets. encode: `Conversion.encode` for actions (T,
+    n), states (T, n).
 
-    Skips episodes in which a learner drove at some step or a label is invalid, and those that failed. Raises
-    `NothingToLearnError` if none is left, `NotFiniteError`, and what `joined_columns` raises.
+    Skips episodes in which a learner drove at some step or a label is invalid, and those that
+    failed. Raises `NothingToLearnError` if none is left, `NotFiniteError`, and what
+    `joined_columns` raises.
     """
     observed = (STATE, ENVIRONMENT_STATE, ACTION)
     table = joined_columns(roots, [*observed, EPISODE_INDEX, LABEL_VALID, ACTOR, SUCCESS])
@@ -117,17 +124,20 @@ def read_demonstrations(
     kept = [piece for piece in pieces if labelled[piece].all() and solved[piece].any()]
     if not kept:
         raise NothingToLearnError(
-            f"none of the {len(pieces)} episodes in {', '.join(map(str, roots))} is the expert's and successful; "
-            "record demonstrations with manip-il record"
+            f"none of the {len(pieces)} episodes in {', '.join(map(str, roots))} is the expert's"
+            " and successful; record demonstrations with manip-il record"
         )
     inputs = np.concatenate([table[STATE], table[ENVIRONMENT_STATE]], axis=1).astype(np.float32)
-    targets = [encode(table[ACTION][piece], table[STATE][piece]).astype(np.float32) for piece in kept]
+    targets = [
+        encode(table[ACTION][piece], table[STATE][piece]).astype(np.float32) for piece in kept
+    ]
     hold = min(len(solved[piece]) - 1 - int(np.argmax(solved[piece])) for piece in kept)
     return Demonstrations(tuple(inputs[piece] for piece in kept), tuple(targets), hold)
 
 
 class RobotEpisode:
-    """An episode of our environment, which is simulated only: no state is stored and no expert is queried.
+    """An episode of our environment, which is simulated only: no state is stored and no expert is
+    queried.
 
     hold: control steps from success to the end; None: success does not end it.
     """
@@ -165,7 +175,10 @@ class RobotEpisode:
 
 @dataclass(frozen=True)
 class ActionRange:
-    """Mean, scale and range of raw targets, (n,) each. A normalised action y stands for mean + scale y, clipped."""
+    """Mean, scale and range of raw targets, (n,) each.
+
+    A normalised action y stands for mean + scale y, clipped.
+    """
 
     mean: F32
     scale: F32
@@ -183,7 +196,10 @@ class ActionRange:
         return np.clip(actions * self.scale + self.mean, self.low, self.high).astype(np.float32)
 
     def normalised(self, targets: F32) -> F32:
-        """Return the normalised actions (B, n) for raw targets (B, n); 0 for a target that never changes."""
+        """Return the normalised actions (B, n) for raw targets (B, n).
+
+        0 for a target that never changes.
+        """
         offsets = np.clip(targets, self.low, self.high) - self.mean
         found = np.divide(offsets, self.scale, out=np.zeros_like(offsets), where=self.scale > 0)
         return found.astype(np.float32)
@@ -194,10 +210,12 @@ class ActionRange:
 
 
 class Lockstep:
-    """B episodes of equal length, run in lockstep; they never end, but continue in the absorbing state.
+    """B episodes of equal length, run in lockstep.
 
-    Observations (B, d + 2): inputs, the flag of the absorbing state, the elapsed share of `horizon`.
-    simulated: control steps of all episodes since `start`, without absorbing states.
+    They never end, but continue in the absorbing state.
+
+    Observations (B, d + 2): inputs, the flag of the absorbing state, the elapsed share of
+    `horizon`. simulated: control steps of all episodes since `start`, without absorbing states.
     executed: actions (B, n) of every step since `start`.
     """
 
@@ -214,7 +232,8 @@ class Lockstep:
             episodes: Each a `RobotEpisode`, or an object with its methods.
             actions: Range of the policy's targets.
             horizon: Control steps of every episode.
-            conversion: Turns the policy's raw targets into actions, given the measured joints (the first inputs).
+            conversion: Turns the policy's raw targets into actions, given the measured joints (the
+                first inputs).
         """
         self.episodes, self.range, self.horizon = episodes, actions, horizon
         self._conversion = conversion or Conversion()
@@ -227,7 +246,10 @@ class Lockstep:
         return np.array([one.solved for one in self.episodes])
 
     def start(self, seed: int) -> F32:
-        """Start the episodes with the seeds `seed`, `seed` + 1, ...; return observations (B, d + 2)."""
+        """Start the episodes with the seeds `seed`, `seed` + 1, ....
+
+        Return observations (B, d + 2).
+        """
         for number, episode in enumerate(self.episodes):
             episode.start(seed + number)
         self._size = len(self.episodes[0].inputs())
@@ -235,7 +257,10 @@ class Lockstep:
         return self._observe()
 
     def step(self, actions: F32) -> F32:
-        """Step all episodes with normalised actions (B, n), converted in one call; return observations (B, d + 2)."""
+        """Step all episodes with normalised actions (B, n), converted in one call.
+
+        Return observations (B, d + 2).
+        """
         targets = self.range.raw(actions)
         running = [row for row, episode in enumerate(self.episodes) if not episode.ended]
         executed = np.zeros(targets.shape)

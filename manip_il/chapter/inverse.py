@@ -1,7 +1,9 @@
-"""Inverse reinforcement learning on `carry`: paths from a dataset, the weights inferred from them, and their report.
+"""Inverse reinforcement learning on `carry`: paths from a dataset, the weights inferred from them,
+and their report.
 
-Layouts, goals and object positions are read from `observation.environment_state`; unsuccessful episodes are skipped.
-The results are the weights of a reward, `reward.json`, and the report of `manip-il reward irl`.
+Layouts, goals and object positions are read from `observation.environment_state`; unsuccessful
+episodes are skipped. The results are the weights of a reward, `reward.json`, and the report of
+`manip-il reward irl`.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +24,15 @@ from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.tables import Table
 from manip_il.mdp import F64, I64
 from manip_il.robots.table import get_robot
-from manip_il.tasks.carry.grid import LENGTH, Demonstration, Grid, cheapest_path, open_features, plan, rivals
+from manip_il.tasks.carry.grid import (
+    LENGTH,
+    Demonstration,
+    Grid,
+    cheapest_path,
+    open_features,
+    plan,
+    rivals,
+)
 from manip_il.tasks.carry.layout import FEATURES
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
 from manip_il.tasks.ladder import AT_GOAL
@@ -51,13 +61,17 @@ class Carried:
 def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> list[Carried]:
     """Return the object's paths in a dataset's successful episodes, in order.
 
-    Raises `ManipError` if the task is not `carry`, no episode succeeded, or a path leads through an obstacle.
+    Raises `ManipError` if the task is not `carry`, no episode succeeded, or a path leads through an
+    obstacle.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
     places = {name: column for column, name in enumerate(spec.environment_state_names)}
     if f"{EDGE}.here" not in places:
-        raise ManipError(f"{root} has the task {spec.task}; expected a dataset of manip-il record --task.type={CARRY}")
+        raise ManipError(
+            f"{root} has the task {spec.task}; expected a dataset of manip-il record"
+            f" --task.type={CARRY}"
+        )
     table = dataset.columns([schema.ENVIRONMENT_STATE, schema.SUCCESS, EPISODE_INDEX])
     scene = scene_of(get_robot(spec.robot).name, CARRY, spec.object)
     index = table[EPISODE_INDEX].ravel()
@@ -67,20 +81,30 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
         on_episode()
         if not table[schema.SUCCESS][index == episode].any():
             continue
-        layout = observed_layout(scene, OBJECT, {name: float(rows[0, column]) for name, column in places.items()})
-        positions = carried_stretch(rows[:, [places[f"{OBJECT}.{axis}"] for axis in "xyz"]], np.array(layout.goal))
+        layout = observed_layout(
+            scene, OBJECT, {name: float(rows[0, column]) for name, column in places.items()}
+        )
+        positions = carried_stretch(
+            rows[:, [places[f"{OBJECT}.{axis}"] for axis in "xyz"]], np.array(layout.goal)
+        )
         grid = Grid(layout, scene.robot)
         path = grid.snap(positions)
         if len(path) < 2 or path[-1] != grid.goal:
-            raise ManipError(f"episode {episode}: the object's path does not lead through free space to the goal")
+            raise ManipError(
+                f"episode {episode}: the object's path does not lead through free space to the goal"
+            )
         found.append(Carried(episode, grid, positions, Demonstration(grid.problem, path)))
     if not found:
-        raise ManipError(f"{root}: the object reaches the goal in none of its {len(np.unique(index))} episodes")
+        raise ManipError(
+            f"{root}: the object reaches the goal in none of its {len(np.unique(index))} episodes"
+        )
     return found
 
 
 def carried_stretch(positions: F64, goal: F64) -> F64:
-    """Return the positions (T, 3) [m] from the last one before the object moves to the first one at the goal (3,)."""
+    """Return the positions (T, 3) [m] from the last one before the object moves to the first one
+    at the goal (3,).
+    """
     moved = np.flatnonzero(np.linalg.norm(positions - positions[0], axis=1) > _MOVED)
     first = max(int(moved[0]) - 1, 0) if len(moved) else 0
     off = np.linalg.norm(positions - goal, axis=1)
@@ -93,8 +117,8 @@ def carried_stretch(positions: F64, goal: F64) -> F64:
 class Learnt:
     """The weights that a method found.
 
-    weights: (K,), divided by the weight of length. open: indices of the weights that are not identified, see
-    `open_features`. intervals: the weights' credible intervals, (K, 2), or None.
+    weights: (K,), divided by the weight of length. open: indices of the weights that are not
+    identified, see `open_features`. intervals: the weights' credible intervals, (K, 2), or None.
     """
 
     method: str
@@ -138,7 +162,9 @@ class Inverse:
     def replanned(self) -> tuple[tuple[I64, F64], ...]:
         """Cheapest paths from the demonstrations' starts: nodes (n,) and features (K,) of each."""
         shown = [one.demonstration for one in self.carried]
-        return tuple(cheapest_path(one.problem, plan(one.problem, self.weights), one.start) for one in shown)
+        return tuple(
+            cheapest_path(one.problem, plan(one.problem, self.weights), one.start) for one in shown
+        )
 
     @property
     def means(self) -> tuple[F64, F64]:
@@ -148,7 +174,9 @@ class Inverse:
 
     @property
     def excess(self) -> float:
-        """Share by which the demonstrations cost more than the re-planned paths, at the learnt weights."""
+        """Share by which the demonstrations cost more than the re-planned paths, at the learnt
+        weights.
+        """
         shown, planned = self.means
         return float(shown @ self.weights / (planned @ self.weights) - 1)
 
@@ -180,7 +208,9 @@ def weight_table(found: Inverse) -> Table:
             weight = "not identified"
         elif learnt.intervals is not None:
             interval = "[{:.2f}, {:.2f}]".format(*learnt.intervals[k])
-        rows.append((name.replace("_", " "), weight, interval, f"{shown[k]:.3f}", f"{planned[k]:.3f}"))
+        rows.append(
+            (name.replace("_", " "), weight, interval, f"{shown[k]:.3f}", f"{planned[k]:.3f}")
+        )
     columns = ("per metre", "weight", f"{LEVEL:.0%} interval", "shown [m]", "planned [m]")
     return Table(columns, tuple(rows)).filled()
 
@@ -190,38 +220,52 @@ def inverse_report(found: Inverse) -> Report:
     names, notes = ", ".join(found.open_names), ()
     if names:
         notes = (
-            f"No demonstration differs from its alternatives in {names}, so these weights are not identified. "
-            "The reward omits them, and plans with 0 instead.",
+            (
+                f"No demonstration differs from its alternatives in {names}, so these weights are"
+                " not identified. The reward omits them, and plans with 0 instead."
+            ),
         )
     weights = Section("What a metre costs", tables=(weight_table(found),), notes=notes)
     costs = Section(
         "The cost over the table",
         figures=(_cost_figure(found),),
         notes=(
-            "Cost of a metre of path, seen from above, at the height at which the object was carried. "
-            "Solid: demonstrated path. Dashed: cheapest path for these weights.",
+            (
+                "Cost of a metre of path, seen from above, at the height at which the object was"
+                " carried. Solid: demonstrated path. Dashed: cheapest path for these weights."
+            ),
         ),
     )
     return Report(
         title="Costs inferred from demonstrations",
-        verdict=f"By the learnt weights, the {len(found.carried)} demonstrations cost {found.excess:.1%} more than the "
-        "cheapest paths.",
+        verdict=(
+            f"By the learnt weights, the {len(found.carried)} demonstrations cost"
+            f" {found.excess:.1%} more than the cheapest paths."
+        ),
         sections=(weights, costs),
     )
 
 
 def _cost_figure(found: Inverse) -> Figure:
-    """Maps of the cost per metre, with demonstrated and planned path, for layouts with the most things on the table."""
+    """Maps of the cost per metre, with demonstrated and planned path, for layouts with the most
+    things on the table.
+    """
     pairs = zip(found.carried, found.replanned, strict=True)
     shown = sorted(pairs, key=lambda pair: -len(pair[0].grid.layout.places))[:_PANELS]
     with drawing(len(shown), size=(3.0, 3.1)) as (drawn, axes):
         for axis, (one, (path, _)) in zip(axes[0], shown, strict=True):
             grid, layout = one.grid, one.grid.layout
-            level = np.abs(grid.points[:, 2] - np.median(one.positions[:, 2])).argmin() % grid.shape[2]
-            cost = (layout.densities(grid.points) @ found.weights).reshape(grid.shape)[:, :, level].T
+            level = (
+                np.abs(grid.points[:, 2] - np.median(one.positions[:, 2])).argmin() % grid.shape[2]
+            )
+            cost = (
+                (layout.densities(grid.points) @ found.weights).reshape(grid.shape)[:, :, level].T
+            )
             (left, near, _), (right, far, _) = grid.points[[0, -1]]
             extent = (left, right, near, far)
-            image = axis.imshow(cost, origin="lower", extent=extent, cmap="Greens", interpolation="bilinear")
+            image = axis.imshow(
+                cost, origin="lower", extent=extent, cmap="Greens", interpolation="bilinear"
+            )
             for name, place in layout.places:
                 axis.annotate(name, place, ha="center", va="center", fontsize=6.5)
             axis.plot(*one.positions[:, :2].T, "-", color=DAGGER, lw=1.8, label="demonstrated")
@@ -230,4 +274,6 @@ def _cost_figure(found: Inverse) -> Figure:
             axis.set(title=f"episode {one.episode}", xticks=[], yticks=[])
             axis.grid(visible=False)
         drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
-        return to_figure(drawn, "Cost of a metre of path over the table, with demonstrated and re-planned paths")
+        return to_figure(
+            drawn, "Cost of a metre of path over the table, with demonstrated and re-planned paths"
+        )

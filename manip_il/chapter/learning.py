@@ -1,4 +1,5 @@
-"""Learning by reinforcement in simulation: GAIL, AIRL and PPO, as loops over a run, and the agent that they improve.
+"""Learning by reinforcement in simulation: GAIL, AIRL and PPO, as loops over a run, and the agent
+that they improve.
 
 Each iteration runs whole episodes, with its own seeds and random streams, so a killed run that is
 resumed from its last finished iteration ends with the same bytes.
@@ -26,8 +27,20 @@ from manip_il.algorithms.results import VALIDATION, Result, Stopwatch, best_vali
 from manip_il.algorithms.run import Run
 from manip_il.chapter.config import LONGER, LearningConfig
 from manip_il.chapter.discriminators import Discriminator
-from manip_il.chapter.episodes import ActionRange, Lockstep, RobotEpisode, Transitions, read_demonstrations
-from manip_il.chapter.ppo import Learner, save_policy, seed_generators, start_conversion, start_policy
+from manip_il.chapter.episodes import (
+    ActionRange,
+    Lockstep,
+    RobotEpisode,
+    Transitions,
+    read_demonstrations,
+)
+from manip_il.chapter.ppo import (
+    Learner,
+    save_policy,
+    seed_generators,
+    start_conversion,
+    start_policy,
+)
 from manip_il.chapter.reward import LearnedReward
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import HOLD, RolloutJob
@@ -54,9 +67,11 @@ _WEIGHTS = "weights.safetensors"
 
 
 def gail(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
-    """Yield each iteration's result: roll out the agent, fit the discriminator, use its reward to improve the agent.
+    """Yield each iteration's result: roll out the agent, fit the discriminator, use its reward to
+    improve the agent.
 
-    Generative adversarial imitation learning (Ho & Ermon, NeurIPS 2016, algorithm 1), with PPO as its policy step.
+    Generative adversarial imitation learning (Ho & Ermon, NeurIPS 2016, algorithm 1), with PPO as
+    its policy step.
     """
     agent = run.agent()
     d = agent.discriminator()
@@ -69,10 +84,12 @@ def gail(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
 
 
 def airl(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
-    """Yield each iteration's result: roll out the agent, fit f, improve the agent by the reward f - log pi.
+    """Yield each iteration's result: roll out the agent, fit f, improve the agent by the reward f -
+    log pi.
 
-    Adversarial inverse reinforcement learning (Fu, Luo & Levine, ICLR 2018, algorithm 1), with PPO as its policy step.
-    The discriminator is D = exp f / (exp f + pi), with the learner's density pi.
+    Adversarial inverse reinforcement learning (Fu, Luo & Levine, ICLR 2018, algorithm 1), with PPO
+    as its policy step. The discriminator is D = exp f / (exp f + pi), with the learner's density
+    pi.
     """
     agent = run.agent()
     d = agent.discriminator(c.discount)
@@ -84,11 +101,14 @@ def airl(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
         yield run.finish(agent)
 
 
-def ppo(run: LearningRun, c: LearningConfig, reward: Callable[[F32], F32] | None = None) -> Iterator[Result]:
-    """Yield each iteration's result: roll out the agent and improve it with a given reward (Schulman et al. 2017).
+def ppo(
+    run: LearningRun, c: LearningConfig, reward: Callable[[F32], F32] | None = None
+) -> Iterator[Result]:
+    """Yield each iteration's result: roll out the agent and improve it with a given reward
+    (Schulman et al. 2017).
 
-    reward: maps rows of joint state, environment state and absolute action, (N, n + k + n), to rewards (N,); by
-    default the reward in the folder `c.reward`.
+    reward: maps rows of joint state, environment state and absolute action, (N, n + k + n), to
+    rewards (N,); by default the reward in the folder `c.reward`.
     """
     reward = reward or LearnedReward.load(c.reward or Path())
     agent = run.agent()
@@ -115,9 +135,12 @@ class LearningRun(Run):
         return Agent(self.config, self._clock)
 
     def begin(self, agent: Agent) -> Iterator[Result]:
-        """Load the agent's last finished iteration and yield its result; else yield that of the initial clone, if any.
+        """Load the agent's last finished iteration and yield its result.
 
-        An iteration thus gets its line in `metrics.jsonl` even if the run was killed right after saving its checkpoint.
+        Else yield that of the initial clone, if any.
+
+        An iteration thus gets its line in `metrics.jsonl` even if the run was killed right after
+        saving its checkpoint.
         """
         checkpoint, start = last_checkpoint(self.folder, resume=True), self.config.start
         if checkpoint is not None:
@@ -138,7 +161,10 @@ class LearningRun(Run):
         return self._result(agent, folder / "last" / PRETRAINED_MODEL)
 
     def _result(self, agent: Agent, policy: Path) -> Result:
-        """The result of an agent's iteration, validated if validation is due; iteration 0 is always validated."""
+        """The result of an agent's iteration, validated if validation is due.
+
+        Iteration 0 is always validated.
+        """
         every, validated = self.config.validation_every, None
         due = agent.simulated // every != agent.validated_at // every
         if due or agent.simulated >= self.config.steps or agent.number == 0:
@@ -156,12 +182,17 @@ class LearningRun(Run):
         )
 
     def _validate_copy(self, policy: Path, number: int) -> EvalResult:
-        """Copy a policy into the run and evaluate it, unless that is done; copy it to `best` if it is the best."""
+        """Copy a policy into the run and evaluate it, unless that is done.
+
+        Copy it to `best` if it is the best.
+        """
         here = self.folder / VALIDATION / f"{number:06d}"
         if not here.is_dir():
             with new_folder(here) as new:
                 shutil.copytree(policy, new / PRETRAINED_MODEL)
-        job = RolloutJob(self.config.env, PolicyDriver.of(here / PRETRAINED_MODEL), HOLD, label="last")
+        job = RolloutJob(
+            self.config.env, PolicyDriver.of(here / PRETRAINED_MODEL), HOLD, label="last"
+        )
         found = self._evaluate(job, here / FILE_NAME, f"iteration {number}")
         if number == best_validation(validations(self.folder)):
             self._keep_best(policy)
@@ -171,19 +202,25 @@ class LearningRun(Run):
 class Agent:
     """An mlp with its own environments, and the demonstrations that it imitates, if any.
 
-    number, simulated: iterations and control steps so far; metrics: of the last iteration. validated_at: control
-    steps at the last validation. Raises what `start_conversion` and `read_demonstrations` raise, and `UsageError` for
-    options that do not fit the demonstrations.
+    number, simulated: iterations and control steps so far; metrics: of the last iteration.
+    validated_at: control steps at the last validation. Raises what `start_conversion` and
+    `read_demonstrations` raise, and `UsageError` for options that do not fit the demonstrations.
     """
 
     def __init__(self, config: LearningConfig, clock: Stopwatch):
         self.config, self._clock = config, clock
         self.number = self.simulated = self.validated_at = 0
         self.metrics: dict[str, float] = {}
-        self._spec = spec = Dataset.open(config.datasets[0]).spec if config.datasets else env_spec(config.env)
+        self._spec = spec = (
+            Dataset.open(config.datasets[0]).spec if config.datasets else env_spec(config.env)
+        )
         start = None if config.start is None else Checkpoint.open(config.start)
         self._conversion = start_conversion(start, config.action_space, spec)
-        demonstrations = read_demonstrations(config.datasets, self._conversion.encode) if config.datasets else None
+        demonstrations = (
+            read_demonstrations(config.datasets, self._conversion.encode)
+            if config.datasets
+            else None
+        )
         horizon = config.episode_steps or config.env.horizon
         if demonstrations and not config.episode_steps:
             horizon = min(horizon, math.ceil(LONGER * demonstrations.longest))
@@ -198,7 +235,9 @@ class Agent:
             log_std, clone = config.first_log_std, start is not None
             self._learner = Learner(self._policy.model, config.ppo, self.envs, log_std, clone=clone)
         self._modules: dict[str, Any] = {"actor_critic": self._learner.policy}
-        self._expert = demonstrations.padded(horizon, actions.normalised) if demonstrations else None
+        self._expert = (
+            demonstrations.padded(horizon, actions.normalised) if demonstrations else None
+        )
 
     def discriminator(self, gamma: float | None = None) -> Discriminator:
         """Return a discriminator, which is saved with the agent. gamma: see `Discriminator`."""
@@ -208,10 +247,15 @@ class Agent:
         return made
 
     def rollouts(self) -> Transitions:
-        """Start an iteration by running its episodes; return all steps, including those in absorbing states."""
+        """Start an iteration by running its episodes.
+
+        Return all steps, including those in absorbing states.
+        """
         config = self.config
         self.number += 1
-        seed = stream_seeds("reinforcement", self.number * config.episodes, config.seed)[-config.episodes]
+        seed = stream_seeds("reinforcement", self.number * config.episodes, config.seed)[
+            -config.episodes
+        ]
         with self._clock.timed("collect"), threads(1):
             seed_generators(self._stream("rollouts"))
             self._rows = self._learner.collect(seed)
@@ -221,22 +265,32 @@ class Agent:
         return self._rows
 
     def executed(self) -> F32:
-        """Return joint state, environment state and absolute action of every step of the last rollouts, (N, d + n)."""
-        return np.column_stack([self._rows.states[:, :-1], np.concatenate(self.envs.executed)]).astype(np.float32)
+        """Return joint state, environment state and absolute action of every step of the last
+        rollouts, (N, d + n).
+        """
+        return np.column_stack(
+            [self._rows.states[:, :-1], np.concatenate(self.envs.executed)]
+        ).astype(np.float32)
 
     def log_prob(self, rows: Transitions) -> F32:
-        """Return log-density plus entropy [nats] of each row's action, (N,); see `Learner.log_prob`."""
+        """Return log-density plus entropy [nats] of each row's action, (N,).
+
+        See `Learner.log_prob`.
+        """
         with threads(1):
             return self._learner.log_prob(rows)
 
     def discriminate(self, d: Discriminator, steps: Transitions) -> None:
         """Fit a discriminator to the demonstrations and the agent's steps.
 
-        The demonstrated actions get noise with the learner's initial standard deviation. Without this noise the
-        discriminator would only detect the learner's exploration noise, and AIRL's densities would be meaningless.
+        The demonstrated actions get noise with the learner's initial standard deviation. Without
+        this noise the discriminator would only detect the learner's exploration noise, and AIRL's
+        densities would be meaningless.
         """
         if self._expert is None:
-            raise UsageError("no demonstrations to compare the learner with; give --dataset.root=DIR")
+            raise UsageError(
+                "no demonstrations to compare the learner with; give --dataset.root=DIR"
+            )
         rng = rng_for(self._stream("discriminator"), "batches")
         with self._clock.timed("fit"), threads(1):
             expert = self._learner.explored(self._expert, rng)
@@ -255,7 +309,9 @@ class Agent:
             self.metrics |= self._learner.improve(rewards, actor=warm, remaining=remaining)
 
     def save(self, folder: Path) -> None:
-        """Write a checkpoint of the iteration: its policy, and everything that the next iteration needs."""
+        """Write a checkpoint of the iteration: its policy, and everything that the next
+        iteration needs.
+        """
         fingerprint, space = env_fingerprint(self.config.env), self._conversion.space
         origin = Origin.of(self._spec, fingerprint, self._options(), action_space=space)
         with new_checkpoint(folder) as new:
@@ -288,7 +344,9 @@ class Agent:
 
 
 def save_modules(modules: Mapping[str, Any], folder: Path) -> None:
-    """Write the weights of modules (name -> module), and the states of their optimisers, to a folder."""
+    """Write the weights of modules (name -> module), and the states of their optimisers, to a
+    folder.
+    """
     for name, module in modules.items():
         (folder / name).mkdir()
         save_file(module.state_dict(), folder / name / _WEIGHTS)

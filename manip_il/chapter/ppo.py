@@ -1,8 +1,9 @@
-"""Proximal policy optimisation of the `mlp` policy's network, with a separate critic, by stable-baselines3's `PPO`.
+"""Proximal policy optimisation of the `mlp` policy's network, with a separate critic, by
+stable-baselines3's `PPO`.
 
-(Schulman et al., Proximal policy optimization algorithms, 2017.) The actor is a new network, or that
-of a clone, with a new spread of its actions. An iteration is one rollout of whole episodes that all
-begin and end together, so that only the weights and the optimiser's state persist between
+(Schulman et al., Proximal policy optimization algorithms, 2017.) The actor is a new network, or
+that of a clone, with a new spread of its actions. An iteration is one rollout of whole episodes
+that all begin and end together, so that only the weights and the optimiser's state persist between
 iterations; they are saved as safetensors and JSON.
 """
 
@@ -35,27 +36,40 @@ from manip_il.learn.network import MLPNetwork, fit_statistics, perceptron, read_
 from manip_il.mdp import F32
 from manip_il.worlds.contract import EnvironmentSpec
 
-EXTRA = 2  # numbers appended to the policy's inputs: flag of the absorbing state, elapsed share of the episode
+# numbers appended to the policy's inputs: flag of the absorbing state, elapsed share of the episode
+EXTRA = 2
 _GAUSSIAN = "gaussian"
 _CENTRED = ("mse", "l1", _GAUSSIAN)  # losses whose outputs are the mean action
 _WIDTH = 256  # units in each of the critic's two hidden layers
 LAST_LR = 0.05  # final learning rate as a share of the first
 TARGET_KL = 0.05  # an iteration's passes stop if the KL divergence exceeds 1.5 times this [nats]
-_METRICS = {"train/approx_kl": "kl", "train/value_loss": "value_loss", "train/explained_variance": "explained_variance"}
+_METRICS = {
+    "train/approx_kl": "kl",
+    "train/value_loss": "value_loss",
+    "train/explained_variance": "explained_variance",
+}
 
 
 class ActorCritic(nn.Module):
-    """Actor and critic. Observations (B, d + 2): raw inputs, flag of the absorbing state, elapsed share of the episode.
+    """Actor and critic.
 
-    The actor sees only the inputs, because it is saved as the policy; the critic sees all, because the return still to
-    come depends on the time to the end of the episode. In the absorbing state actions do nothing, so their density is 1
-    there and the actor learns nothing from it. The same holds for action dimensions that the demonstrations never vary.
+    Observations (B, d + 2): raw inputs, flag of the absorbing state, elapsed share of the episode.
+
+    The actor sees only the inputs, because it is saved as the policy; the critic sees all, because
+    the return still to come depends on the time to the end of the episode. In the absorbing state
+    actions do nothing, so their density is 1 there and the actor learns nothing from it. The same
+    holds for action dimensions that the demonstrations never vary.
 
     It has those of the methods of stable-baselines3's `ActorCriticPolicy` that `PPO.train` calls.
     """
 
     def __init__(
-        self, _spaces: Any, _action_space: Any, lr: Callable[[float], float], network: MLPNetwork, **_: Any
+        self,
+        _spaces: Any,
+        _action_space: Any,
+        lr: Callable[[float], float],
+        network: MLPNetwork,
+        **_: Any,
     ) -> None:
         super().__init__()
         self.actor = network
@@ -79,7 +93,9 @@ class ActorCritic(nn.Module):
     def values(self, obs: Tensor) -> Tensor:
         """Return values, (B, 1)."""
         live = 1.0 - obs[:, -EXTRA, None]
-        return self.critic(torch.cat([self.actor.encode(obs[:, :-EXTRA]) * live, obs[:, -EXTRA:]], dim=1))
+        return self.critic(
+            torch.cat([self.actor.encode(obs[:, :-EXTRA]) * live, obs[:, -EXTRA:]], dim=1)
+        )
 
     def gaussian(self, obs: Tensor) -> Normal:
         """Return the distribution of the actions, (B, n)."""
@@ -99,7 +115,10 @@ class ActorCritic(nn.Module):
 
     @property
     def spread(self) -> Tensor:
-        """Deviations of the action dimensions, (n,), in normalised units; 0 for those that never vary."""
+        """Deviations of the action dimensions, (n,), in normalised units.
+
+        0 for those that never vary.
+        """
         return floored_log_std(self.head.raw_log_std).exp().detach() * self._free
 
     @property
@@ -112,7 +131,15 @@ class Learner:
 
     policy: ActorCritic
 
-    def __init__(self, network: MLPNetwork, config: PPOConfig, env: Lockstep, log_std: float, *, clone: bool = False):
+    def __init__(
+        self,
+        network: MLPNetwork,
+        config: PPOConfig,
+        env: Lockstep,
+        log_std: float,
+        *,
+        clone: bool = False,
+    ):
         """Make the critic and the optimiser.
 
         Args:
@@ -127,7 +154,10 @@ class Learner:
         """
         batch = len(env.episodes)
         if batch % config.minibatches:
-            raise UsageError(f"episodes is {batch}; expected a multiple of ppo.minibatches ({config.minibatches})")
+            raise UsageError(
+                f"episodes is {batch}; expected a multiple of ppo.minibatches"
+                f" ({config.minibatches})"
+            )
         self.env = env
         lr = config.first_lr(clone=clone)
         self.ppo = PPO(
@@ -144,20 +174,26 @@ class Learner:
             _init_setup_model=False,
         )
         self.ppo.observation_space, self.ppo.action_space = (
-            spaces.Box(-np.inf, np.inf, (size,), np.float32) for size in (network.inputs + EXTRA, network.n)
+            spaces.Box(-np.inf, np.inf, (size,), np.float32)
+            for size in (network.inputs + EXTRA, network.n)
         )
         self.ppo.n_envs = batch
         self.ppo._setup_model()
-        self.ppo.set_logger(Logger(folder=None, output_formats=[]))  # `configure` would make a folder in /tmp
+        # `configure` would make a folder in /tmp
+        self.ppo.set_logger(Logger(folder=None, output_formats=[]))
         self.policy = self.ppo.policy  # pyright: ignore[reportAttributeAccessIssue]
-        raw = MIN_LOG_STD + math.log(math.expm1(max(log_std - MIN_LOG_STD, 1e-3)))  # the inverse of `floored_log_std`
+        # the inverse of `floored_log_std`
+        raw = MIN_LOG_STD + math.log(math.expm1(max(log_std - MIN_LOG_STD, 1e-3)))
         with torch.no_grad():
             self.policy.head.raw_log_std.fill_(raw)
         self._first_spread = self.policy.spread.numpy().copy()
 
     @torch.no_grad()
     def collect(self, seed: int) -> Transitions:
-        """Run one episode in every environment; return all steps, grouped by time. seed: see `Lockstep.start`."""
+        """Run one episode in every environment.
+
+        Return all steps, grouped by time. seed: see `Lockstep.start`.
+        """
         env, buffer = self.env, self.ppo.rollout_buffer
         buffer.reset()
         seen = env.start(seed)
@@ -169,14 +205,22 @@ class Learner:
             buffer.add(seen, actions.numpy(), nothing, nothing + (step == 0), values, log_prob)
             seen = env.step(env.range.clip(actions.numpy()))
         after = np.concatenate([buffer.observations[1:], seen[None]])
-        states, next_states = (rows[..., :-1].reshape(-1, rows.shape[-1] - 1) for rows in (buffer.observations, after))
-        return self._clipped(Transitions(states, buffer.actions.reshape(len(states), -1), next_states))
+        states, next_states = (
+            rows[..., :-1].reshape(-1, rows.shape[-1] - 1) for rows in (buffer.observations, after)
+        )
+        return self._clipped(
+            Transitions(states, buffer.actions.reshape(len(states), -1), next_states)
+        )
 
-    def improve(self, rewards: F32, *, actor: bool = True, remaining: float = 1.0) -> dict[str, float]:
-        """Take an iteration's gradient steps, given the rewards (N,) of the steps from `collect`. Returns metrics.
+    def improve(
+        self, rewards: F32, *, actor: bool = True, remaining: float = 1.0
+    ) -> dict[str, float]:
+        """Take an iteration's gradient steps, given the rewards (N,) of the steps from `collect`.
 
-        actor: whether to update the actor as well as the critic. remaining: share of the run that is left; the
-        learning rate is multiplied by it, but by no less than `LAST_LR`.
+        Returns metrics.
+
+        actor: whether to update the actor as well as the critic. remaining: share of the run that
+        is left; the learning rate is multiplied by it, but by no less than `LAST_LR`.
         """
         buffer = self.ppo.rollout_buffer
         buffer.rewards[:] = rewards.reshape(buffer.rewards.shape)
@@ -191,7 +235,8 @@ class Learner:
 
     @torch.no_grad()
     def log_prob(self, rows: Transitions) -> F32:
-        """Return log pi + H of every row, (N,): its action's log-density plus the actor's entropy [nats].
+        """Return log pi + H of every row, (N,): its action's log-density plus the actor's entropy
+        [nats].
 
         It is 0 in the absorbing state, where no action is sampled.
         """
@@ -200,7 +245,10 @@ class Learner:
         return (log_prob + entropy).numpy()
 
     def explored(self, rows: Transitions, rng: np.random.Generator) -> Transitions:
-        """Return the N rows; the actions have noise of the actor's initial spread and are clipped to their range."""
+        """Return the N rows.
+
+        The actions have noise of the actor's initial spread and are clipped to their range.
+        """
         noise = rng.standard_normal(rows.actions.shape, dtype=np.float32) * self._first_spread
         return self._clipped(Transitions(rows.states, rows.actions + noise, rows.next_states))
 
@@ -216,7 +264,9 @@ def seed_generators(seed: int) -> None:
     np.random.seed(seed % 2**32)  # noqa: NPY002
 
 
-def start_conversion(start: Checkpoint | None, space: str | None, spec: EnvironmentSpec) -> Conversion:
+def start_conversion(
+    start: Checkpoint | None, space: str | None, spec: EnvironmentSpec
+) -> Conversion:
     """Return the conversion of the actor's actions.
 
     Args:
@@ -233,7 +283,10 @@ def start_conversion(start: Checkpoint | None, space: str | None, spec: Environm
     loss = start.config.get("loss")
     if start.kind != MLP or loss not in _CENTRED:
         known = ", ".join(_CENTRED)
-        raise UsageError(f"{start.path} is of type {start.kind!r}, loss {loss!r}; expected an mlp with loss {known}")
+        raise UsageError(
+            f"{start.path} is of type {start.kind!r}, loss {loss!r}; expected an mlp with loss"
+            f" {known}"
+        )
     start.check_fits(spec)
     if space not in (None, start.space):
         raise MismatchError("action space", str(start.path), start.space, "--action_space", space)
@@ -241,9 +294,13 @@ def start_conversion(start: Checkpoint | None, space: str | None, spec: Environm
 
 
 def start_policy(
-    start: Checkpoint | None, conversion: Conversion, spec: EnvironmentSpec, rows: tuple[F32, F32] | None
+    start: Checkpoint | None,
+    conversion: Conversion,
+    spec: EnvironmentSpec,
+    rows: tuple[F32, F32] | None,
 ) -> MLPPolicy:
-    """Return an mlp with a Gaussian loss, whose new weights are drawn from torch's global generator.
+    """Return an mlp with a Gaussian loss, whose new weights are drawn from torch's global
+    generator.
 
     Args:
         start: A clone, which keeps its own statistics and acts as before.
@@ -255,7 +312,11 @@ def start_policy(
         UsageError: If neither `start` nor `rows` is given.
     """
     options = (start.mlp_options if start else None) or {}
-    options |= {"loss": _GAUSSIAN, "action_space": conversion.space, "grippers": conversion.grippers}
+    options |= {
+        "loss": _GAUSSIAN,
+        "action_space": conversion.space,
+        "grippers": conversion.grippers,
+    }
     config = MLPConfig(**{name: value for name, value in options.items() if name != "type"})
     inputs = [STATE, *([ENVIRONMENT_STATE] if spec.environment_state_names else [])]
     config.input_features, config.output_features = policy_features(features(spec), inputs)
@@ -266,12 +327,16 @@ def start_policy(
         inputs = policy.model.expanded(torch.from_numpy(rows[0])).numpy()
         policy.model.set_statistics(fit_statistics(inputs, rows[1], _GAUSSIAN))
     else:
-        raise UsageError("no demonstrations and no policy to start from; give --dataset.root=DIR or --init=RUN")
+        raise UsageError(
+            "no demonstrations and no policy to start from; give --dataset.root=DIR or --init=RUN"
+        )
     return policy
 
 
 def save_policy(policy: MLPPolicy, conversion: Conversion, folder: Path) -> None:
-    """Write configuration, weights and processors of an mlp to a new folder, in LeRobot's layout."""
+    """Write configuration, weights and processors of an mlp to a new folder, in LeRobot's
+    layout.
+    """
     folder.mkdir()
     policy.save_pretrained(folder)
     processors = make_pre_post_processors(policy.config)

@@ -17,7 +17,15 @@ from torch import Tensor, nn
 
 from manip_il import checks
 from manip_il.errors import ManipError, MismatchError
-from manip_il.learn.checkpoint import CONFIG, META_FILE, WEIGHTS, Origin, in_one_line, read_config, read_origin
+from manip_il.learn.checkpoint import (
+    CONFIG,
+    META_FILE,
+    WEIGHTS,
+    Origin,
+    in_one_line,
+    read_config,
+    read_origin,
+)
 from manip_il.learn.network import read_weights, threads
 from manip_il.mdp import F32, F64
 from manip_il.worlds.contract import EnvironmentSpec
@@ -28,12 +36,14 @@ _ROWS = 16_384  # rows evaluated at a time
 
 @dataclass(frozen=True)
 class RewardShape:
-    """Sizes of the networks. members: networks in the ensemble; width: units per layer; depth: hidden layers.
+    """Sizes of the networks. members: networks in the ensemble; width: units per layer.
 
-    ways: for each offset between two things [m], its input columns: x, y and z, or x and y. The logarithm of the
-    offset's length is an input, too, so that the last centimetres count as much as the first decimetres. Progress
-    mostly depends on distances, and a few hundred answers are too few to learn a square root from. unread: input
-    columns that the networks do not use.
+    depth: hidden layers.
+
+    ways: for each offset between two things [m], its input columns: x, y and z, or x and y. The
+    logarithm of the offset's length is an input, too, so that the last centimetres count as much as
+    the first decimetres. Progress mostly depends on distances, and a few hundred answers are too
+    few to learn a square root from. unread: input columns that the networks do not use.
     """
 
     members: int = 8
@@ -44,24 +54,33 @@ class RewardShape:
 
 
 def ways_of(spec: EnvironmentSpec) -> tuple[tuple[int, ...], ...]:
-    """Return the input columns of every offset in the environment state, such as `goal_from_object`.
+    """Return the input columns of every offset in the environment state, such as
+    `goal_from_object`.
 
-    Each offset appears twice, in 3D and in the plane of the table, because the hand approaches from above.
+    Each offset appears twice, in 3D and in the plane of the table, because the hand approaches from
+    above.
     """
-    place = {name: len(spec.joint_names) + at for at, name in enumerate(spec.environment_state_names)}
+    place = {
+        name: len(spec.joint_names) + at for at, name in enumerate(spec.environment_state_names)
+    }
     names = [name.removesuffix(".x") for name in place if "_from_" in name and name.endswith(".x")]
     axes = [[f"{name}.{axis}" for axis in plane] for name in names for plane in ("xyz", "xy")]
     return tuple(tuple(place[one] for one in way) for way in axes if set(way) <= place.keys())
 
 
 def joints_of(spec: EnvironmentSpec) -> tuple[int, ...]:
-    """Return the input columns of the arm's joints and their targets if the environment state has the hand's pose.
+    """Return the input columns of the arm's joints and their targets if the environment state has
+    the hand's pose.
 
-    Otherwise return (). A few hundred answers are too few to learn that joints are redundant with the pose.
+    Otherwise return (). A few hundred answers are too few to learn that joints are redundant with
+    the pose.
     """
     if not {"ee.x", "ee.y", "ee.z"} <= set(spec.environment_state_names):
         return ()
-    arm, action = len(spec.joint_names) - 1, len(spec.joint_names) + len(spec.environment_state_names)
+    arm, action = (
+        len(spec.joint_names) - 1,
+        len(spec.joint_names) + len(spec.environment_state_names),
+    )
     return (*range(arm), *range(action, action + arm))
 
 
@@ -73,8 +92,9 @@ def shape_for(spec: EnvironmentSpec, members: int) -> RewardShape:
 class RewardNetwork(nn.Module):
     """M perceptrons from (state, environment state, action) to a reward.
 
-    Inputs are standardised and clamped to `CLAMP` standard deviations, so that states far from the data have the reward
-    at the bound. `low`, `high`: mean rewards of the M perceptrons that `forward` maps to 0 and 1.
+    Inputs are standardised and clamped to `CLAMP` standard deviations, so that states far from the
+    data have the reward at the bound. `low`, `high`: mean rewards of the M perceptrons that
+    `forward` maps to 0 and 1.
     """
 
     CLAMP = 5.0
@@ -92,7 +112,9 @@ class RewardNetwork(nn.Module):
         inputs = len(self.read) + len(shape.ways)
         sizes = [inputs, *[shape.width] * shape.depth, 1]
         layers = list(itertools.pairwise(sizes))
-        self.weights = nn.ParameterList(torch.zeros(shape.members, fan_in, out) for fan_in, out in layers)
+        self.weights = nn.ParameterList(
+            torch.zeros(shape.members, fan_in, out) for fan_in, out in layers
+        )
         self.biases = nn.ParameterList(torch.zeros(shape.members, 1, out) for _, out in layers)
         self.register_buffer("mean", torch.zeros(inputs))
         self.register_buffer("std", torch.ones(inputs))
@@ -100,7 +122,9 @@ class RewardNetwork(nn.Module):
         self.register_buffer("high", torch.ones(()))
 
     def initialise(self, generator: torch.Generator) -> None:
-        """Draw normal weights of variance 2 / fan-in (He et al. 2015), a hundredth as wide in the last layer."""
+        """Draw normal weights of variance 2 / fan-in (He et al. 2015), a hundredth as wide in
+        the last layer.
+        """
         with torch.no_grad():
             for number, weight in enumerate(self.weights):
                 last = number == len(self.weights) - 1
@@ -108,8 +132,12 @@ class RewardNetwork(nn.Module):
                 weight.copy_(spread * torch.randn(weight.shape, generator=generator))
 
     def features(self, inputs: Tensor) -> Tensor:
-        """Return the used columns of the inputs (B, d), then the log-lengths of the K offsets, (B, up to d + K)."""
-        lengths = [(inputs[:, way].norm(dim=-1, keepdim=True) + self.NEAR).log() for way in self.ways]
+        """Return the used columns of the inputs (B, d), then the log-lengths of the K offsets,
+        (B, up to d + K).
+        """
+        lengths = [
+            (inputs[:, way].norm(dim=-1, keepdim=True) + self.NEAR).log() for way in self.ways
+        ]
         return torch.cat([inputs[:, self.read], *lengths], dim=-1)
 
     def members(self, inputs: Tensor) -> Tensor:
@@ -124,7 +152,9 @@ class RewardNetwork(nn.Module):
 
     @override
     def forward(self, inputs: Tensor) -> Tensor:
-        """Return the mean of the M rewards, (B,), for inputs (B, d), scaled to be 0 at `low` and 1 at `high`."""
+        """Return the mean of the M rewards, (B,), for inputs (B, d), scaled to be 0 at `low` and
+        1 at `high`.
+        """
         return (self.members(inputs).mean(0) - self.low) / (self.high - self.low)
 
 
@@ -155,14 +185,18 @@ class LearnedReward:
         return cls(network, origin)
 
     def check_fits(self, name: str, spec: EnvironmentSpec) -> None:
-        """Raise `MismatchError` unless `spec` has this reward's task and columns. name: what messages call `spec`."""
+        """Raise `MismatchError` unless `spec` has this reward's task and columns. name: what
+        messages call `spec`.
+        """
         if self.origin.task != spec.task:
             raise MismatchError("task", "the reward", self.origin.task, name, spec.task)
         self.origin.check_fits(spec)
 
     @torch.inference_mode()
     def __call__(self, inputs: F32) -> F32:
-        """Return every row's reward, (B,), for rows of state, environment state and absolute action, (B, n + k + n)."""
+        """Return every row's reward, (B,), for rows of state, environment state and absolute
+        action, (B, n + k + n).
+        """
         with threads(1):
             parts = [self.network(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)]
         return np.concatenate(parts)
@@ -171,7 +205,9 @@ class LearnedReward:
     def members(self, inputs: F32) -> F64:
         """Return every network's reward in log-odds per step, (M, B). inputs: as in `__call__`."""
         with threads(1):
-            parts = [self.network.members(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)]
+            parts = [
+                self.network.members(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)
+            ]
         return np.concatenate(parts, axis=1).astype(np.float64)
 
 
@@ -182,7 +218,8 @@ def write_reward(
     options: Mapping[str, Any],
     fingerprint: Mapping[str, Any],
 ) -> None:
-    """Write a `pretrained_model` folder: config.json, model.safetensors, and its origin, manip_il.json.
+    """Write a `pretrained_model` folder: config.json, model.safetensors, and its origin,
+    manip_il.json.
 
     options: the options of the fit. Raises `OSError` if it cannot be written.
     """
@@ -190,4 +227,6 @@ def write_reward(
     config = {"type": PREFERENCE, **asdict(network.shape)}
     for name, values in ((CONFIG, config), (META_FILE, origin.to_json())):
         (folder / name).write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
-    save_file({f"model.{name}": tensor for name, tensor in network.state_dict().items()}, folder / WEIGHTS)
+    save_file(
+        {f"model.{name}": tensor for name, tensor in network.state_dict().items()}, folder / WEIGHTS
+    )

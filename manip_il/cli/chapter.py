@@ -1,6 +1,7 @@
 """`manip-il reward pairs|ask|answer|fit`: rewards from preferences.
 
-`manip-il theory`: the proven bounds of cloning and DAgger, on small MDPs and on the rounds of a run.
+`manip-il theory`: the proven bounds of cloning and DAgger, on small MDPs and on the rounds of a
+run.
 
 `manip-il rl gail`, `airl`, `ppo`: reinforcement learning from demonstrations or a learnt reward.
 """
@@ -20,16 +21,21 @@ from manip_il.option import Seeded, option
 class OfPairs:
     """Options of a command on pairs of clips."""
 
-    pairs: Path = option(MISSING, "pairs.json from manip-il reward pairs", positional=True, exists="")
-    sources: list[Path] = option(MISSING, "the datasets or runs from which the pairs were chosen", exists="datasets/")
+    pairs: Path = option(
+        MISSING, "pairs.json from manip-il reward pairs", positional=True, exists=""
+    )
+    sources: list[Path] = option(
+        MISSING, "the datasets or runs from which the pairs were chosen", exists="datasets/"
+    )
 
 
 @dataclass(frozen=True)
 class PairsOptions(Seeded, OutputFile):
-    """Choose pairs of clips from datasets of one task, for comparison by people (ask) or simulated teachers (answer).
+    """Choose pairs of clips from datasets of one task, for comparison by people (ask) or simulated
+    teachers (answer).
 
-    A SOURCE is a dataset or a run; each round of a DAgger run is one source. Without --reward all sources appear
-    equally often. Episodes shorter than --clip are left out.
+    A SOURCE is a dataset or a run; each round of a DAgger run is one source. Without --reward all
+    sources appear equally often. Episodes shorter than --clip are left out.
 
     Example: manip-il reward pairs runs/dagger --count=200 --output=pairs.json
     """
@@ -37,16 +43,20 @@ class PairsOptions(Seeded, OutputFile):
     sources: list[Path] = option(MISSING, "manip-il datasets, or runs", positional=True)
     clip: int = option(20, "length of a clip [control steps]", at_least=1)
     count: int = option(200, "number of pairs", at_least=1)
-    reward: Path | None = option(None, "a fitted reward, for pairs on which its networks disagree most", exists="")
+    reward: Path | None = option(
+        None, "a fitted reward, for pairs on which its networks disagree most", exists=""
+    )
     output: Path = output_file("pairs.json")
 
 
 @dataclass(frozen=True)
 class AskOptions(OfPairs, OutputFile):
-    """Write a page that shows the pairs as films and asks which is better; it works offline and on a phone.
+    """Write a page that shows the pairs as films and asks which is better.
 
-    Keys: left and right arrow, down for equal, S to skip, U to undo. The browser keeps the answers until they are saved
-    as preferences.json.
+    It works offline and on a phone.
+
+    Keys: left and right arrow, down for equal, S to skip, U to undo. The browser keeps the answers
+    until they are saved as preferences.json.
 
     Example: manip-il reward ask pairs.json --sources=runs/dagger --output=ask.html
     """
@@ -59,30 +69,40 @@ class AskOptions(OfPairs, OutputFile):
 class AnswerOptions(OfPairs, Seeded, OutputFile):
     """Let a simulated teacher answer pairs by the clips' true progress (B-Pref, Lee et al. 2021).
 
-    Teachers: perfect; boltzmann:TEMPERATURE, less certain if returns are close; mistaken:SHARE, wrong on that share
-    of the pairs. A clip's return is the sum of progress over its steps.
+    Teachers: perfect; boltzmann:TEMPERATURE, less certain if returns are close; mistaken:SHARE,
+    wrong on that share of the pairs. A clip's return is the sum of progress over its steps.
 
     Example: manip-il reward answer pairs.json --sources=runs/dagger --output=preferences.json
     """
 
-    teacher: str = option("perfect", "perfect, boltzmann[:TEMPERATURE] (default 1) or mistaken[:SHARE] (default 0.1)")
+    teacher: str = option(
+        "perfect", "perfect, boltzmann[:TEMPERATURE] (default 1) or mistaken[:SHARE] (default 0.1)"
+    )
     output: Path = output_file("preferences.json")
 
 
 @dataclass(frozen=True)
 class FitOptions(OfPairs, Seeded, Output):
-    """Fit a reward of state and action to answers about pairs (Bradley-Terry), as an ensemble of small networks.
+    """Fit a reward of state and action to answers about pairs (Bradley-Terry), as an ensemble of
+    small networks.
 
-    Each pair is held out from one network; fit.json has the agreement on held-out pairs. ANSWERS are files from ask or
-    answer, by one person or several, about PAIRS or --more_pairs. OUTPUT_DIR/pretrained_model holds the reward.
+    Each pair is held out from one network; fit.json has the agreement on held-out pairs. ANSWERS
+    are files from ask or answer, by one person or several, about PAIRS or --more_pairs.
+    OUTPUT_DIR/pretrained_model holds the reward.
 
     Example: manip-il reward fit pairs.json preferences.json --sources=runs/dagger
     --output_dir=runs/reward
     """
 
-    answers: list[Path] = option(MISSING, "preferences.json from ask or answer", positional=True, exists="")
-    more_pairs: list[Path] = option(list, "further pairs.json of the same task and clip length", exists="")
-    members: int = option(8, "number of networks in the ensemble, and of folds of the pairs", at_least=3, at_most=64)
+    answers: list[Path] = option(
+        MISSING, "preferences.json from ask or answer", positional=True, exists=""
+    )
+    more_pairs: list[Path] = option(
+        list, "further pairs.json of the same task and clip length", exists=""
+    )
+    members: int = option(
+        8, "number of networks in the ensemble, and of folds of the pairs", at_least=3, at_most=64
+    )
     output_dir: Path = output_folder("runs/reward")
 
 
@@ -90,7 +110,8 @@ class FitOptions(OfPairs, Seeded, Output):
 class IrlOptions(OfDataset, Seeded, Output):
     """Learn the weights of a reward from a dataset of demonstrations of the task carry.
 
-    Writes reward.json, for --task.type=carry:FILE, and report.html, with the weights and maps of the cost.
+    Writes reward.json, for --task.type=carry:FILE, and report.html, with the weights and maps of
+    the cost.
 
     Example: manip-il reward irl datasets/carry --method=bayesian --output_dir=runs/irl
     """
@@ -101,17 +122,23 @@ class IrlOptions(OfDataset, Seeded, Output):
 
 @dataclass(frozen=True)
 class TheoryOptions(EngineOptions, Output):
-    """Compare the proven bounds of cloning and DAgger with exactly solved MDPs, linear systems and the arm.
+    """Compare the proven bounds of cloning and DAgger with exactly solved MDPs, linear systems and
+    the arm.
 
-    Writes report.html and theory.json. SOURCE is a run of `manip-il dagger`: for every round, the policy's
-    distribution shift and its excess cost are measured, and the cost is compared with DAgger's bound.
+    Writes report.html and theory.json. SOURCE is a run of `manip-il dagger`: for every round, the
+    policy's distribution shift and its excess cost are measured, and the cost is compared with
+    DAgger's bound.
 
     Example: manip-il theory runs/dagger --output_dir=runs/theory
     """
 
-    source: Path | None = option(None, "a run of manip-il dagger, to measure its rounds", positional=True, exists="")
+    source: Path | None = option(
+        None, "a run of manip-il dagger, to measure its rounds", positional=True, exists=""
+    )
     episodes: int = option(50, "episodes of the expert and of every round's policy", at_least=2)
-    cases: int = option(30, "episodes per kind of perturbation, to measure the cost of a wrong action", at_least=1)
+    cases: int = option(
+        30, "episodes per kind of perturbation, to measure the cost of a wrong action", at_least=1
+    )
     output_dir: Path = output_folder("runs/theory")
 
 
@@ -121,7 +148,9 @@ class Learning(EngineOptions, ResumableOutput):
 
     method: ClassVar[str]
     first: ClassVar[str] = "dataset.root init steps reward validation_episodes output_dir resume"
-    init: Path | None = option(None, "a cloned mlp (a checkpoint or a run) to start from; by default a new policy")
+    init: Path | None = option(
+        None, "a cloned mlp (a checkpoint or a run) to start from; by default a new policy"
+    )
     settings: Given = given(LearningConfig, prefix="")
     ppo: PPOConfig = field(default_factory=PPOConfig)
     workers: int | None = worker_count(1)
@@ -131,8 +160,9 @@ class Learning(EngineOptions, ResumableOutput):
 class GailOptions(Learning):
     """Imitate demonstrations by generative adversarial imitation learning (GAIL).
 
-    A discriminator learns to tell the learner's steps from the expert's, and PPO learns to fool it. OUTPUT_DIR/best
-    holds the policy with the highest validation success: an mlp like that of `manip-il train`.
+    A discriminator learns to tell the learner's steps from the expert's, and PPO learns to fool it.
+    OUTPUT_DIR/best holds the policy with the highest validation success: an mlp like that of
+    `manip-il train`.
 
     Example: manip-il rl gail --dataset.root=datasets/demos --init=runs/cloned
     --output_dir=runs/gail
@@ -148,7 +178,8 @@ class GailOptions(Learning):
 class AirlOptions(GailOptions):
     """Imitate demonstrations by adversarial inverse reinforcement learning (AIRL).
 
-    Like `manip-il rl gail`, with the discriminator exp f / (exp f + pi): f is a learnt reward, pi the policy's density.
+    Like `manip-il rl gail`, with the discriminator exp f / (exp f + pi): f is a learnt reward, pi
+    the policy's density.
 
     Example: manip-il rl airl --dataset.root=datasets/demos --init=runs/cloned
     --output_dir=runs/airl
@@ -162,8 +193,8 @@ class AirlOptions(GailOptions):
 class PpoOptions(Learning):
     """Improve a cloned policy (--init) by PPO with a reward learnt from preferences.
 
-    Episodes continue after success, because the reward scores every state. OUTPUT_DIR/best holds the policy with the
-    highest validation success, which may be the initial one.
+    Episodes continue after success, because the reward scores every state. OUTPUT_DIR/best holds
+    the policy with the highest validation success, which may be the initial one.
 
     Example: manip-il rl ppo --init=runs/cloned --reward=runs/reward --output_dir=runs/ppo
     """

@@ -15,15 +15,21 @@ from manip_il.worlds.table import env_spec
 if TYPE_CHECKING:
     from manip_il.collect.workers import Engine
 
-OF_POLICY: Given = dict.fromkeys(("robot", "task", "control_hz", "object"))  # by default those of the policy
+# by default those of the policy
+OF_POLICY: Given = dict.fromkeys(("robot", "task", "control_hz", "object"))
 SMALL: Given = {"height": 96, "width": 96}  # picture size for policies [pixels]
-_CONDITIONS = "object, dynamics, knocked, sensing, random_actions; with cameras also view, clutter, late"
+_CONDITIONS = (
+    "object, dynamics, knocked, sensing, random_actions; with cameras also view, clutter, late"
+)
 
 DATASET = "a LeRobot v3.0 dataset"
 
 
 def default_cameras(env: EnvConfig) -> tuple[str, ...]:
-    """Return the cameras used if none are named; raise `Unable` if no camera draws the environment."""
+    """Return the cameras used if none are named.
+
+    Raise `Unable` if no camera draws the environment.
+    """
     spec = env_spec(env)
     spec.require("drawn", "it has no cameras")
     return spec.default_cameras
@@ -55,7 +61,9 @@ class EngineOptions:
 
     workers: int | None = worker_count()
     engine: Literal["local", "ray"] = option(
-        "local", "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, else on this machine)", free=True
+        "local",
+        "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, else on this machine)",
+        free=True,
     )
 
     def open_engine(self) -> Engine:
@@ -71,7 +79,8 @@ class Tested:
 
     suite: str = option(
         "nominal",
-        f"test conditions: nominal, disturbed, randomised, all, a single one ({_CONDITIONS}) or a YAML file of ranges",
+        f"test conditions: nominal, disturbed, randomised, all, a single one ({_CONDITIONS}) or a"
+        " YAML file of ranges",
     )
 
 
@@ -81,11 +90,16 @@ class Trusting:
 
     trust: bool = option(
         False,
-        "load the models and run the code that a checkpoint names (smolvla, pi0, groot, ...): only for sources that "
-        "you trust; cannot be set in a file",
+        "load the models and run the code that a checkpoint names (smolvla, pi0, groot, ...): only"
+        " for sources that you trust; cannot be set in a file",
         command_line_only=True,
         free=True,
     )
+
+
+_THEIR_CAMERAS = "".join(
+    f"for {name}: {', '.join(world.cameras)}; " for name, world in WORLDS.items() if world.cameras
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,15 +108,19 @@ class Pictured:
 
     cameras: list[str] = option(
         list,
-        f"any of {', '.join(CAMERAS)}; "
-        f"{''.join(f'for {name}: ' + ', '.join(one.cameras) + '; ' for name, one in WORLDS.items() if one.cameras)}"
-        "by default all if pictures are needed, else none",
+        f"any of {', '.join(CAMERAS)}; {_THEIR_CAMERAS}by default all if pictures are needed, else"
+        " none",
     )
     image: Given = given(CameraConfig)
 
     def camera_config(self, env: EnvConfig, look: Look | None = None) -> CameraConfig:
-        """Return the cameras, by default those of `default_cameras`; `UsageError` for an invalid value."""
-        cameras = CameraConfig(tuple(self.cameras) or default_cameras(env), **self.image, look=look or Look())
+        """Return the cameras, by default those of `default_cameras`.
+
+        `UsageError` for an invalid value.
+        """
+        cameras = CameraConfig(
+            tuple(self.cameras) or default_cameras(env), **self.image, look=look or Look()
+        )
         env_spec(env).require_cameras(cameras)
         return cameras
 
@@ -111,4 +129,6 @@ class Pictured:
 class Varied(Pictured):
     """Options of a command that randomises worlds and renders pictures."""
 
-    vary: list[str] = option(list, f"what to randomise between episodes: {_CONDITIONS}; or YAML files of ranges")
+    vary: list[str] = option(
+        list, f"what to randomise between episodes: {_CONDITIONS}; or YAML files of ranges"
+    )

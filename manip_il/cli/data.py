@@ -38,7 +38,10 @@ class RenameMap(dict[str, str]):
 
     @classmethod
     def parse(cls, text: str) -> RenameMap:
-        """Read JSON, as for LeRobot's `--rename_map`. Raises `UsageError` if it is something else."""
+        """Read JSON, as for LeRobot's `--rename_map`.
+
+        Raises `UsageError` if it is something else.
+        """
         with suppress(ValueError):
             if isinstance(found := parse_yaml(text), dict):
                 return cls({str(old): str(new) for old, new in found.items()})
@@ -47,19 +50,25 @@ class RenameMap(dict[str, str]):
 
 @dataclass(frozen=True)
 class MergeOptions(Replacing):
-    """Merge datasets into one, with their episodes in the order given; or take some episodes, also of a single dataset.
+    """Merge datasets into one, with their episodes in the order given.
 
-    Every column, every frame's text and all films are copied. Robot, rate, columns and codecs must agree, and the task
-    if manip-il recorded it. The provenance of datasets of manip-il names the sources.
+    Or take some episodes, also of a single dataset.
+
+    Every column, every frame's text and all films are copied. Robot, rate, columns and codecs must
+    agree, and the task if manip-il recorded it. The provenance of datasets of manip-il names the
+    sources.
 
     Example: manip-il data merge datasets/demos datasets/more --output=datasets/both
     """
 
-    datasets: list[Path] = option(MISSING, "LeRobot v3.0 datasets", exists="datasets/", positional=True)
+    datasets: list[Path] = option(
+        MISSING, "LeRobot v3.0 datasets", exists="datasets/", positional=True
+    )
     output: Path = option(MISSING, "folder of the new dataset")
     episodes: list[str] = option(
         list,
-        "episodes to take, numbered through all datasets: 0:50 for the first 50, or [0,3,5]; by default all",
+        "episodes to take, numbered through all datasets: 0:50 for the first 50, or [0,3,5]; by"
+        " default all",
         flag="dataset.episodes",
     )
     renamed: RenameMap = option(
@@ -73,21 +82,33 @@ class MergeOptions(Replacing):
 class Edit(Replacing):
     """Options for editing a dataset's states."""
 
-    source: Path = option(MISSING, "a manip-il dataset; for redraw, also a run", positional=True, exists="datasets/")
-    target: Path | None = option(
-        None, "folder of the new dataset; by default SOURCE_rendered, _relabelled or _redrawn", positional=True
+    source: Path = option(
+        MISSING, "a manip-il dataset; for redraw, also a run", positional=True, exists="datasets/"
     )
-    robot: NameOrPath | None = option(None, "YAML file of the dataset's robot, if it is your own", flag="robot.type")
-    task: NameOrPath | None = option(None, "Python file of the dataset's task, if it is your own", flag="task.type")
+    target: Path | None = option(
+        None,
+        "folder of the new dataset; by default SOURCE_rendered, _relabelled or _redrawn",
+        positional=True,
+    )
+    robot: NameOrPath | None = option(
+        None, "YAML file of the dataset's robot, if it is your own", flag="robot.type"
+    )
+    task: NameOrPath | None = option(
+        None, "Python file of the dataset's task, if it is your own", flag="task.type"
+    )
     object: NameOrPath | None = option(
-        None, "mesh:FILE:LENGTH as in the recording, if the dataset's object is a mesh", flag="task.object"
+        None,
+        "mesh:FILE:LENGTH as in the recording, if the dataset's object is a mesh",
+        flag="task.object",
     )
     workers: int | None = option(None, "number of processes; by default one per core", at_least=1)
 
 
 @dataclass(frozen=True)
 class RenderOptions(Edit, Pictured):
-    """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights. No simulation runs.
+    """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights.
+
+    No simulation runs.
 
     Example: manip-il data render datasets/demos datasets/dim --cameras=front --look.brightness=0.6
     """
@@ -99,9 +120,9 @@ class RenderOptions(Edit, Pictured):
 class RelabelOptions(Edit):
     """Relabel every state of a dataset with the current expert, instead of recording again.
 
-    TARGET is SOURCE with new labels; executed actions, pictures and all other columns stay the same. States in which
-    the expert was not queried get a label, too. Prints how many labels changed: by more than 1 % of a joint's longest
-    step, in phase, or in validity.
+    TARGET is SOURCE with new labels; executed actions, pictures and all other columns stay the
+    same. States in which the expert was not queried get a label, too. Prints how many labels
+    changed: by more than 1 % of a joint's longest step, in phase, or in validity.
 
     Example: manip-il data relabel datasets/demos
     """
@@ -109,29 +130,37 @@ class RelabelOptions(Edit):
 
 @dataclass(frozen=True, kw_only=True)
 class RedrawOptions(Edit, Varied, Seeded):
-    """Randomise the goals, untouched objects and appearance of visited states; label and render each scene.
+    """Randomise the goals, untouched objects and appearance of visited states.
 
-    TARGET is a LeRobot dataset for training policies on pictures; each scene is one episode. Scenes without a valid
-    label are left out. --vary takes view, clutter, object (its colour), sensing (its noise), or YAML files of
-    ranges.
+    Label and render each scene.
+
+    TARGET is a LeRobot dataset for training policies on pictures; each scene is one episode. Scenes
+    without a valid label are left out. --vary takes view, clutter, object (its colour), sensing
+    (its noise), or YAML files of ranges.
 
     Example: manip-il data redraw runs/dagger datasets/redrawn --frames=20000
     """
 
     frames: int = option(20_000, "number of scenes to draw", at_least=1)
-    pictures: bool = option(True, "render the scenes; false: write states only, for --policy.states")
+    pictures: bool = option(
+        True, "render the scenes; false: write states only, for --policy.states"
+    )
     scenes: bool = option(True, "draw new goals and objects; false: keep the visited states")
     branch_steps: int = option(
-        1, "control steps that the expert drives from every scene; more than 1 for act and diffusion", at_least=1
+        1,
+        "control steps that the expert drives from every scene; more than 1 for act and diffusion",
+        at_least=1,
     )
     image: Given = given(CameraConfig, **SMALL)
 
 
 @dataclass(frozen=True)
 class CheckOptions(OfDataset):
-    """Check any LeRobot v3.0 dataset: files, rows, video frames, statistics, and whether a policy can learn from it.
+    """Check any LeRobot v3.0 dataset: files, rows, video frames, statistics, and whether a policy
+    can learn from it.
 
-    Prints one line per finding, with what to do. The exit code is 1 if there are errors, 0 if only warnings.
+    Prints one line per finding, with what to do. The exit code is 1 if there are errors, 0 if only
+    warnings.
 
     Example: manip-il data check datasets/demos
     """
@@ -139,7 +168,9 @@ class CheckOptions(OfDataset):
 
 @dataclass(frozen=True)
 class RepairOptions(CheckOptions):
-    """Rebuild a dataset from its journals; without them recompute counts and statistics, and move leftover files away.
+    """Rebuild a dataset from its journals.
+
+    Without them recompute counts and statistics, and move leftover files away.
 
     Replaced files are kept in DATASET.before-repair. Then the dataset is checked again.
 
@@ -152,11 +183,13 @@ class ScoreOptions(OfDataset, Output):
     """Score every frame and episode of a dataset by a reward, and list the worst episodes.
 
     Writes scores.json, and rabc.parquet with the frames' weights for manip-il train --weights= and
-    lerobot-train --sample_weighting.progress_path=. If the dataset says which episodes failed, also prints how well the
-    score detects them.
+    lerobot-train --sample_weighting.progress_path=. If the dataset says which episodes failed, also
+    prints how well the score detects them.
 
     Example: manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores
     """
 
-    reward: str = option(MISSING, "a folder from manip-il reward fit, or progress for the true progress")
+    reward: str = option(
+        MISSING, "a folder from manip-il reward fit, or progress for the true progress"
+    )
     output_dir: Path = output_folder("runs/scores")

@@ -1,8 +1,10 @@
 """`manip-il eval`: how often a policy succeeds on unseen seeds.
 
-`manip-il compare`: two policies or runs on the same seeds, with the confidence in their difference, or a study.
+`manip-il compare`: two policies or runs on the same seeds, with the confidence in their difference,
+or a study.
 
-A study runs `manip-il dagger` with several sets of options (its arms), each with the same training seeds.
+A study runs `manip-il dagger` with several sets of options (its arms), each with the same training
+seeds.
 """
 
 from dataclasses import MISSING, dataclass, field
@@ -31,16 +33,28 @@ class EvalGroup:
     """`--eval.*`: the episodes to run."""
 
     n_episodes: int | None = option(
-        None, "test episodes; by default 100, or up to 10,000 with --until_width", at_least=1, grows=True
+        None,
+        "test episodes; by default 100, or up to 10,000 with --until_width",
+        at_least=1,
+        grows=True,
     )
-    first: int = option(0, "index of the first seed in the stream, to run a large evaluation in parts", at_least=0)
+    first: int = option(
+        0, "index of the first seed in the stream, to run a large evaluation in parts", at_least=0
+    )
     hold: int | None = option(
-        10, "control steps after success until an episode ends; null: it ends at the horizon", at_least=0
+        10,
+        "control steps after success until an episode ends; null: it ends at the horizon",
+        at_least=0,
     )
     batch_size: int = option(
-        25, "episodes that run in lockstep and share policy calls; does not change results", at_least=1, free=True
+        25,
+        "episodes that run in lockstep and share policy calls; does not change results",
+        at_least=1,
+        free=True,
     )
-    stream: Literal["test", "validation"] = option("test", "which stream of seeds; no policy is selected on test seeds")
+    stream: Literal["test", "validation"] = option(
+        "test", "which stream of seeds; no policy is selected on test seeds"
+    )
     films: int = option(2, "number of failures to film, and of successes", at_least=0, free=True)
 
 
@@ -48,14 +62,17 @@ class EvalGroup:
 class EvalOptions(Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
     """Measure a policy's success on unseen seeds; writes eval.json and report.html.
 
-    With EVALUATION, an eval.json or its folder, no policy is evaluated: --replay=SEED runs one of its episodes again
-    and films it; two or more, such as parts run on several machines, are merged. --check renders a picture and reports
-    whether this machine or container can evaluate.
+    With EVALUATION, an eval.json or its folder, no policy is evaluated: --replay=SEED runs one of
+    its episodes again and films it; two or more, such as parts run on several machines, are merged.
+    --check renders a picture and reports whether this machine or container can evaluate.
 
     Example: manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert
     """
 
-    first: ClassVar[str] = "policy.path policy.type eval.n_episodes suite robot.type task.type output_dir replay resume"
+    first: ClassVar[str] = (
+        "policy.path policy.type eval.n_episodes suite robot.type task.type output_dir replay"
+        " resume"
+    )
     evaluation: list[Path] = option(
         list, "evaluations: one with --replay, or several to merge", positional=True, exists=""
     )
@@ -63,12 +80,19 @@ class EvalOptions(Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
     env: Given = given(EnvConfig, **OF_POLICY)
     eval: EvalGroup = field(default_factory=EvalGroup)
     until_width: float | None = option(
-        None, "stop when the confidence interval is this narrow; 0.02: 2 percentage points", at_least=0.0001, at_most=1
+        None,
+        "stop when the confidence interval is this narrow; 0.02: 2 percentage points",
+        at_least=0.0001,
+        at_most=1,
     )
     output_dir: Path = output_folder("runs/eval")
-    replay: int | None = option(None, "seed of the episode of EVALUATION to replay", at_least=0, free=True)
+    replay: int | None = option(
+        None, "seed of the episode of EVALUATION to replay", at_least=0, free=True
+    )
     video: Path | None = option(None, "MP4 file for the replay", free=True)
-    health: bool = option(False, "check that this machine can evaluate and render", flag="check", free=True)
+    health: bool = option(
+        False, "check that this machine can evaluate and render", flag="check", free=True
+    )
 
 
 @dataclass(frozen=True)
@@ -82,11 +106,13 @@ class TrialGroup:
 class ComparisonOptions:
     """Which rounds of the runs are compared, and on how many episodes."""
 
-    checkpoint: Literal["best", "last"] = option("best", "round of a run to test: the best on validation, or the last")
+    checkpoint: Literal["best", "last"] = option(
+        "best", "round of a run to test: the best on validation, or the last"
+    )
     at: Literal["end", "labels", "episodes", "steps", "seconds"] = option(
         "end",
-        "which rounds of a run count: all (end), or those within the number of labels, episodes, steps or seconds (of "
-        "collecting and fitting) that every run reached",
+        "which rounds of a run count: all (end), or those within the number of labels, episodes,"
+        " steps or seconds (of collecting and fitting) that every run reached",
     )
     eval: TrialGroup = field(default_factory=TrialGroup)
 
@@ -95,28 +121,35 @@ class ComparisonOptions:
 class StudyFile(ComparisonOptions):
     """Content of a study's YAML file.
 
-    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs. Arms of
-    different tasks are not compared.
+    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm
+    differs. Arms of different tasks are not compared.
     """
 
     common: Open = field(default_factory=dict[str, Any])
     arms: Open = field(default_factory=dict[str, Any])
-    training_seeds: int = option(3, "runs of every arm, one per seed", at_least=1, at_most=MAX_SEED, grows=True)
+    training_seeds: int = option(
+        3, "runs of every arm, one per seed", at_least=1, at_most=MAX_SEED, grows=True
+    )
     baseline: str | None = option(None, "the arm to compare others with; by default the first")
-    target: float = option(0.95, "report what it costs to reach this validation success", at_least=0.0, at_most=1.0)
+    target: float = option(
+        0.95, "report what it costs to reach this validation success", at_least=0.0, at_most=1.0
+    )
 
 
 @dataclass(frozen=True)
 class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
-    """Compare two policies, runs, or folders of several training seeds on the same test seeds; or run a whole study.
+    """Compare two policies, runs, or folders of several training seeds on the same test seeds.
 
-    Each side is an eval.json, a policy, a run of manip-il dagger, or a folder with one of these per training seed
-    (seed_0, seed_1, ...). Two eval.json files are compared directly; other sides are evaluated first. Writes
-    compare.json and report.html.
+    Or run a whole study.
 
-    One YAML file instead of two sides is a study: every arm (a set of options) is trained with several seeds, tested
-    on the same unseen seeds, and compared. The file holds `common` and `arms` (options of manip-il dagger),
-    training_seeds, eval, checkpoint, at, baseline and target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs.
+    Each side is an eval.json, a policy, a run of manip-il dagger, or a folder with one of these per
+    training seed (seed_0, seed_1, ...). Two eval.json files are compared directly; other sides are
+    evaluated first. Writes compare.json and report.html.
+
+    One YAML file instead of two sides is a study: every arm (a set of options) is trained with
+    several seeds, tested on the same unseen seeds, and compared. The file holds `common` and `arms`
+    (options of manip-il dagger), training_seeds, eval, checkpoint, at, baseline and target.
+    OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs.
 
     Example: manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare
     """
@@ -131,6 +164,9 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting, EngineOptions,
     )
     env: Given = given(EnvConfig, **OF_POLICY)
     training_seeds: int | None = option(
-        None, "training seeds of a study, if not its file's; may grow with --resume=true", at_least=1, free=True
+        None,
+        "training seeds of a study, if not its file's; may grow with --resume=true",
+        at_least=1,
+        free=True,
     )
     output_dir: Path = output_folder("runs/compare")

@@ -1,6 +1,7 @@
 """`manip-il COMMAND --option=value ...`: dispatch of commands, help, and error messages.
 
-Nothing heavy is imported before a command's options are read, so that help and errors appear at once.
+Nothing heavy is imported before a command's options are read, so that help and errors appear at
+once.
 """
 
 import importlib
@@ -24,41 +25,78 @@ PROGRAM = "manip-il"
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 
 
-# name -> `module:OptionsClass` in `manip_il.cli`, and a summary. The function is in the module of `manip_il.cli.run`
-# with the same name or, so that it imports only what it needs, in the one that a third part names.
+# name -> `module:OptionsClass` in `manip_il.cli`, and a summary. The function is in the module of
+# `manip_il.cli.run` with the same name or, so that it imports only what it needs, in the one that a
+# third part names.
 COMMANDS = {
-    "demo": ("imitation:DemoOptions", "run a small complete example: record, clone, DAgger, report"),
-    "record": ("imitation:RecordOptions:record", "record demonstrations of the expert as a dataset"),
+    "demo": (
+        "imitation:DemoOptions",
+        "run a small complete example: record, clone, DAgger, report",
+    ),
+    "record": (
+        "imitation:RecordOptions:record",
+        "record demonstrations of the expert as a dataset",
+    ),
     "train": ("imitation:TrainOptions:train", "train a policy on a dataset (behaviour cloning)"),
     "dagger": ("imitation:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),
     "eval": ("evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
-    "compare": ("evaluate:CompareOptions:imitation", "compare policies, runs or whole studies on the same seeds"),
+    "compare": (
+        "evaluate:CompareOptions:imitation",
+        "compare policies, runs or whole studies on the same seeds",
+    ),
     "view": ("robots:ViewOptions:view", "watch a robot at its task, in a window or a browser"),
     "serve": ("robots:ServeOptions:serve", "run a virtual SO-101 for LeRobot's own programs"),
     "push": ("transfer:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
     "pull": ("transfer:PullOptions", "download a dataset or policy and verify every file"),
     "export": ("transfer:ExportOptions:export", "export a policy as ONNX"),
-    "theory": ("chapter:TheoryOptions:theory", "compare the proven bounds of cloning and DAgger with a run"),
+    "theory": (
+        "chapter:TheoryOptions:theory",
+        "compare the proven bounds of cloning and DAgger with a run",
+    ),
     "data check": ("data:CheckOptions", "find errors in any LeRobot dataset"),
     "data repair": ("data:RepairOptions", "repair a dataset, from its journals or its own data"),
-    "data render": ("data:RenderOptions", "render a dataset again, with other cameras, sizes or lights"),
-    "data redraw": ("data:RedrawOptions", "randomise and render visited states for policies with cameras"),
+    "data render": (
+        "data:RenderOptions",
+        "render a dataset again, with other cameras, sizes or lights",
+    ),
+    "data redraw": (
+        "data:RedrawOptions",
+        "randomise and render visited states for policies with cameras",
+    ),
     "data relabel": ("data:RelabelOptions", "relabel a dataset with the current expert"),
     "data build": ("data:BuildOptions", "rebuild a dataset from its journals"),
     "data merge": ("data:MergeOptions", "merge datasets of one robot and task"),
-    "data score": ("data:ScoreOptions:chapter", "score a dataset's episodes by a reward, to find bad ones"),
-    "data to-mcap": ("transfer:McapExportOptions:mcap", "convert a dataset to MCAP files, for Foxglove etc."),
-    "data from-mcap": ("transfer:McapImportOptions:mcap", "convert MCAP files to a dataset with a mapping file"),
+    "data score": (
+        "data:ScoreOptions:chapter",
+        "score a dataset's episodes by a reward, to find bad ones",
+    ),
+    "data to-mcap": (
+        "transfer:McapExportOptions:mcap",
+        "convert a dataset to MCAP files, for Foxglove etc.",
+    ),
+    "data from-mcap": (
+        "transfer:McapImportOptions:mcap",
+        "convert MCAP files to a dataset with a mapping file",
+    ),
     "robot new": ("robots:RobotNewOptions", "write a first YAML file for an arm's MJCF"),
     "robot check": ("robots:RobotCheckOptions", "measure what an arm can do, before recording"),
     "robot certify": ("robots:CertifyOptions", "measure from which states the expert recovers"),
-    "rl gail": ("chapter:GailOptions:learning", "imitate by GAIL: reinforcement learning from demonstrations"),
+    "rl gail": (
+        "chapter:GailOptions:learning",
+        "imitate by GAIL: reinforcement learning from demonstrations",
+    ),
     "rl airl": ("chapter:AirlOptions:learning", "imitate by AIRL, which also learns a reward"),
-    "rl ppo": ("chapter:PpoOptions:learning", "improve a cloned policy with a reward learnt from preferences"),
+    "rl ppo": (
+        "chapter:PpoOptions:learning",
+        "improve a cloned policy with a reward learnt from preferences",
+    ),
     "reward irl": ("chapter:IrlOptions", "learn a reward from demonstrations of the task carry"),
     "reward pairs": ("chapter:PairsOptions", "choose pairs of clips to compare"),
     "reward ask": ("chapter:AskOptions", "make a page that asks which clip is better"),
-    "reward answer": ("chapter:AnswerOptions", "let a simulated teacher answer pairs by true progress"),
+    "reward answer": (
+        "chapter:AnswerOptions",
+        "let a simulated teacher answer pairs by true progress",
+    ),
     "reward fit": ("chapter:FitOptions", "learn a reward from answers"),
 }
 GROUPS = {
@@ -74,9 +112,13 @@ _GLOBAL_HELP = """\
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; return 0 (done), 1 (the work failed), 2 (invalid command line) or 130 (interrupted)."""
+    """Run one command.
+
+    Return 0 (done), 1 (the work failed), 2 (invalid command line) or 130 (interrupted).
+    """
     given = list(sys.argv[1:] if argv is None else argv)
-    end = given.index("--") if "--" in given else len(given)  # the words after `--` are another program's
+    # the words after `--` are another program's
+    end = given.index("--") if "--" in given else len(given)
     own = [word for word in given[:end] if word not in ("--debug", "--quiet")]
     progress.set_quiet("--quiet" in given[:end])
     logging.getLogger("manip_il").handlers = [progress.Warnings()]
@@ -126,7 +168,8 @@ def _dispatch(own: list[str], others: list[str]) -> None:
 def _report(error: BaseException, words: list[str]) -> int:
     """Print an error as one line on standard error; return the exit code."""
     code = 1
-    if isinstance(error, BrokenPipeError):  # the reader of standard output, such as `head`, has ended
+    # the reader of standard output, such as `head`, has ended
+    if isinstance(error, BrokenPipeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return code
     if isinstance(error, KeyboardInterrupt):
@@ -142,23 +185,26 @@ def _report(error: BaseException, words: list[str]) -> int:
 
 
 def _clean(text: str, words: list[str]) -> str:
-    """Remove control characters, and tokens, keys and passwords from the command line or a library's errors."""
+    """Remove control characters, and tokens, keys and passwords from the command line or a
+    library's errors.
+    """
     return printable(redact(text, words))
 
 
 def _help(group: str = "") -> str:
     """Return the help of a group of commands, or of all."""
     if group:
-        rows = {name: summary for name, (_, summary) in COMMANDS.items() if name.startswith(f"{group} ")}
+        rows = {
+            name: summary for name, (_, summary) in COMMANDS.items() if name.startswith(f"{group} ")
+        }
         return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_table(rows)}"
     single = {name: summary for name, (_, summary) in COMMANDS.items() if " " not in name}
     groups = {f"{name} ...": summary for name, summary in GROUPS.items()}
     return (
-        f"usage: {PROGRAM} COMMAND [--option=value ...]\n\n"
-        "Robot-arm imitation learning without teleoperation.\n\n"
-        f"commands:\n{_table(single | groups)}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
-        f"{PROGRAM} COMMAND --help lists a command's options.\n"
-        f"example: {PROGRAM} demo --output_dir=runs/demo"
+        f"usage: {PROGRAM} COMMAND [--option=value ...]\n\nRobot-arm imitation learning without"
+        f" teleoperation.\n\ncommands:\n{_table(single | groups)}\n\n{_GLOBAL_HELP}\n  --version   "
+        f" show the version\n\n{PROGRAM} COMMAND --help lists a command's options.\nexample:"
+        f" {PROGRAM} demo --output_dir=runs/demo"
     )
 
 
@@ -170,7 +216,9 @@ def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
     options = options_of(cls)
     first = () if "--help=all" in words else getattr(cls, "first", "").split()
     positional = [option for option in options if option.positional]
-    places = "".join(f" {one.label}" if one.default is MISSING else f" [{one.label}]" for one in positional)
+    places = "".join(
+        f" {one.label}" if one.default is MISSING else f" [{one.label}]" for one in positional
+    )
     rows = dict(_row(one) for one in options if not first or one.positional or one.name in first)
     rest = len(options) - len(rows)
     rows["--config_path=FILE.yaml"] = "read options from YAML; the command line overrides them"

@@ -64,17 +64,21 @@ class Output(Replacing):
 
     @contextmanager
     def open(self, *sources: Path, saved: Any = None) -> Generator[Path]:
-        """Lock and prepare the folder, and write the options to `config.yaml`; a resumed run must have the same ones.
+        """Lock and prepare the folder, and write the options to `config.yaml`.
 
-        sources: further inputs, which must not be replaced. saved: options to write in place of the command's. Raises
-        what `prepare_output` and `check_same_options` raise.
+        A resumed run must have the same ones.
+
+        sources: further inputs, which must not be replaced. saved: options to write in place of the
+        command's. Raises what `prepare_output` and `check_same_options` raise.
         """
         with self.lock(*sources, saved=saved) as prepare:
             prepare()
             yield self.output_dir
 
     def lock(self, *sources: Path, saved: Any = None) -> Any:
-        """Return a context manager like `open`, in which a function that it yields prepares the folder."""
+        """Return a context manager like `open`, in which a function that it yields prepares the
+        folder.
+        """
         options = saved or self
         kinds = {self.output_dir: output_of(type(options).__name__)}
         return locked(kinds, self, options, [*_inputs(options), *sources])
@@ -92,13 +96,19 @@ class OutputFile(Replacing):
     output: Path = output_file()
 
     def check(self) -> None:
-        """Raise `UsageError` if the file exists, unless it may be replaced and this program wrote it."""
+        """Raise `UsageError` if the file exists, unless it may be replaced and this program
+        wrote it.
+        """
         if not self.output.exists():
             return
         if not is_our_file(self.output):
-            raise UsageError(f"{self.output} exists and does not say that manip-il wrote it; choose another name")
+            raise UsageError(
+                f"{self.output} exists and does not say that manip-il wrote it; choose another name"
+            )
         if not self.overwrite:
-            raise UsageError(f"{self.output} already exists; choose another name, or give --overwrite=true")
+            raise UsageError(
+                f"{self.output} already exists; choose another name, or give --overwrite=true"
+            )
 
 
 @contextmanager
@@ -135,18 +145,26 @@ def locked(
 
 def _inputs(options: Any) -> Iterator[Path]:
     """Yield the paths in a command's options that exist, except its output folder."""
-    waiting: list[Any] = [{name: value for name, value in to_plain(options).items() if name != "output_dir"}]
+    waiting: list[Any] = [
+        {name: value for name, value in to_plain(options).items() if name != "output_dir"}
+    ]
     while waiting:
         value = waiting.pop()
         if isinstance(value, dict | list):
             waiting += value.values() if isinstance(value, dict) else value
         elif isinstance(value, str):
             words = (value, *value.split(":"))  # also `mesh:FILE:LENGTH` and `carry:FILE`
-            yield from (path for word in words if word and (path := Path(word).expanduser()).exists())
+            yield from (
+                path for word in words if word and (path := Path(word).expanduser()).exists()
+            )
 
 
 def prepare_output(
-    kinds: Mapping[Path, str], *, resume: bool = False, overwrite: bool = False, sources: Iterable[Path] = ()
+    kinds: Mapping[Path, str],
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    sources: Iterable[Path] = (),
 ) -> None:
     """Prepare folders for writing: on return they are absent or empty, unless `resume`.
 
@@ -160,20 +178,26 @@ def prepare_output(
         UsageError: what `require_writable` raises, and for options that contradict each other.
     """
     if resume and overwrite:
-        raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
+        raise UsageError(
+            "--resume=true and --overwrite=true contradict each other; give one of them"
+        )
     for folder, kind in () if resume else kinds.items():  # all of them, before one is emptied
         require_writable(folder, kind, overwrite, sources)
     for folder in kinds:
         if resume:
-            for left in folder.rglob(f".*{PARTIAL}"):  # files of a killed writer; `new_folder` clears partial folders
+            # files of a killed writer; `new_folder` clears partial folders
+            for left in folder.rglob(f".*{PARTIAL}"):
                 if left.is_file():
                     left.unlink()
         elif folder.exists():
             clear(folder)
 
 
-def require_writable(folder: Path, kind: str, overwrite: bool, sources: Iterable[Path] = ()) -> None:
-    """Raise `UsageError` unless `folder` is absent or empty, or `overwrite` is set and it is a folder of this kind.
+def require_writable(
+    folder: Path, kind: str, overwrite: bool, sources: Iterable[Path] = ()
+) -> None:
+    """Raise `UsageError` unless `folder` is absent or empty, or `overwrite` is set and it is a
+    folder of this kind.
 
     Args:
         folder: The output folder.
@@ -189,7 +213,9 @@ def require_writable(folder: Path, kind: str, overwrite: bool, sources: Iterable
 
 
 def about(options: Any) -> dict[str, Any]:
-    """Return the fields of a `Report` that say how it was made: the command line and the resolved options."""
+    """Return the fields of a `Report` that say how it was made: the command line and the
+    resolved options.
+    """
     return {"command": command_line(), "config": to_plain(options)}
 
 
@@ -201,7 +227,9 @@ def publish(
     page: Report | None = None,
     options: Any = None,
 ) -> None:
-    """Write a result as JSON, and its report beside it if there is one; print its tables, lines and files.
+    """Write a result as JSON, and its report beside it if there is one.
+
+    Print its tables, lines and files.
 
     options: as for `about`.
     """
@@ -221,10 +249,11 @@ def save_options(folder: Path, options: Any) -> None:
 
 
 def check_same_options(folder: Path, options: Any) -> None:
-    """Raise `MismatchError`, which names the option, unless the run in `folder` was started with the same options.
+    """Raise `MismatchError`, which names the option, unless the run in `folder` was started with
+    the same options.
 
-    Options with `free` in their metadata may differ, those with `grows` may increase. A missing or empty folder is
-    accepted; any other one without `config.yaml` is a `UsageError`.
+    Options with `free` in their metadata may differ, those with `grows` may increase. A missing or
+    empty folder is accepted; any other one without `config.yaml` is a `UsageError`.
     """
     path = folder / CONFIG_FILE
     # A run that was killed at the start leaves at most a partial file with a hidden name.
@@ -235,5 +264,7 @@ def check_same_options(folder: Path, options: Any) -> None:
         was, now = known.value(before), known.value(options)
         has_grown = known.metadata.get("grows") and None not in (was, now) and now >= was
         if was != now and not known.metadata.get("free") and not has_grown:
-            what = f"--{known.name}{', which may only grow,' if known.metadata.get('grows') else ''}"
+            what = (
+                f"--{known.name}{', which may only grow,' if known.metadata.get('grows') else ''}"
+            )
             raise MismatchError(what, str(path), was, "the command line", now)

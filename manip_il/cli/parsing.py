@@ -1,14 +1,18 @@
-"""Options from the command line (`--a.b=c`) and YAML, in LeRobot's style; the command line overrides YAML.
+"""Options from the command line (`--a.b=c`) and YAML, in LeRobot's style.
 
-Draccus decodes the values (see `decode`). Its parser is not used because it exits through argparse, turns a
-range error of a nested dataclass into a decoding error, and has no open groups.
+The command line overrides YAML.
 
-Options of commands: the fields of their dataclasses, the values that a type accepts, and their names in help.
+Draccus decodes the values (see `decode`). Its parser is not used because it exits through argparse,
+turns a range error of a nested dataclass into a decoding error, and has no open groups.
 
-A field's type is int, float, bool, str, Path, `NameOrPath` or a `Literal` of names; one of these or None; a list of one
-of these; a class with `parse` and `__str__` (`linear:5`); another dataclass (a group, `--dataset.root`); or `Open`: a
-dict of a group whose options only another program knows (`--policy.*`). `given(Config)` is a dict of the options of
-`Config` that the user gave; the command makes a `Config` from them.
+Options of commands: the fields of their dataclasses, the values that a type accepts, and their
+names in help.
+
+A field's type is int, float, bool, str, Path, `NameOrPath` or a `Literal` of names; one of these or
+None; a list of one of these; a class with `parse` and `__str__` (`linear:5`); another dataclass (a
+group, `--dataset.root`); or `Open`: a dict of a group whose options only another program knows
+(`--policy.*`). `given(Config)` is a dict of the options of `Config` that the user gave; the command
+makes a `Config` from them.
 """
 
 import dataclasses
@@ -45,12 +49,17 @@ _METAVARS: dict[Any, str] = {
 
 
 def given(
-    cls: type, prefix: str | None = None, only: Collection[str] = (), fixed: Collection[str] = (), **own: Any
+    cls: type,
+    prefix: str | None = None,
+    only: Collection[str] = (),
+    fixed: Collection[str] = (),
+    **own: Any,
 ) -> Any:
-    """Return a field that holds, as a dict (`Given`), those options of the dataclass `cls` that the user gave.
+    """Return a field that holds, as a dict (`Given`), those options of the dataclass `cls` that the
+    user gave.
 
-    only: names of fields, by default all. fixed: those that may not grow when this command is resumed. own: defaults
-    that replace those of `cls`; the dict always holds them.
+    only: names of fields, by default all. fixed: those that may not grow when this command is
+    resumed. own: defaults that replace those of `cls`; the dict always holds them.
     """
     metadata = {"given": cls, "only": only, "fixed": fixed}
     names = {} if prefix is None else {"prefix": prefix}
@@ -61,11 +70,12 @@ def given(
 class Option:
     """One option of a command. default: `MISSING` if the user must give a value.
 
-    path: attributes and keys that lead from the command's options to its value. metadata: `help`, one line;
-    `positional` for a value without a name; `command_line_only` for an option that no file may set; `exists` for a path
-    that must exist, with its prefix on the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`; `free`
-    and `grows` for an option that a resumed run may change (see `check_same_options`). is_given: whether
-    it is an option of another class, see `given`.
+    path: attributes and keys that lead from the command's options to its value. metadata: `help`,
+    one line; `positional` for a value without a name; `command_line_only` for an option that no
+    file may set; `exists` for a path that must exist, with its prefix on the Hub (`datasets/`);
+    `flag`, the full name; `at_least` and `at_most`; `free` and `grows` for an option that a resumed
+    run may change (see `check_same_options`). is_given: whether it is an option of another class,
+    see `given`.
     """
 
     name: str  # dotted: `dataset.root`
@@ -100,28 +110,53 @@ class Option:
     def value(self, options: Any) -> Any:
         """Return the option's value in a command's options."""
         for key in self.path:
-            options = options.get(key, self.default) if isinstance(options, dict) else getattr(options, key)
+            options = (
+                options.get(key, self.default)
+                if isinstance(options, dict)
+                else getattr(options, key)
+            )
         return options
 
 
-def options_of(cls: type, base: Any = None, prefix: str = "", path: tuple[str, ...] = ()) -> list[Option]:
-    """Return all options of a dataclass, groups expanded, keyword-only ones last. base: instance with the defaults."""
+def options_of(
+    cls: type, base: Any = None, prefix: str = "", path: tuple[str, ...] = ()
+) -> list[Option]:
+    """Return all options of a dataclass, groups expanded, keyword-only ones last. base: instance
+    with the defaults.
+    """
     found: list[Option] = []
     for one in sorted(dataclasses.fields(cls), key=lambda one: one.kw_only is True):
         inner, here = one.metadata.get("prefix", f"{prefix}{one.name}."), (*path, one.name)
         kind, default = type_of(cls, one), default_of(one, base)
         if source := one.metadata.get("given"):
             for theirs in dataclasses.fields(source):
-                if "help" in theirs.metadata and theirs.name in (one.metadata["only"] or (theirs.name,)):
+                if "help" in theirs.metadata and theirs.name in (
+                    one.metadata["only"] or (theirs.name,)
+                ):
                     name = theirs.metadata.get("flag", inner + theirs.name)
                     own, about = default.get(theirs.name, default_of(theirs)), dict(theirs.metadata)
                     if theirs.name in one.metadata["fixed"]:
                         about["grows"] = False
-                    found.append(Option(name, (*here, theirs.name), type_of(source, theirs), own, about, is_given=True))
+                    found.append(
+                        Option(
+                            name,
+                            (*here, theirs.name),
+                            type_of(source, theirs),
+                            own,
+                            about,
+                            is_given=True,
+                        )
+                    )
         elif dataclasses.is_dataclass(kind):
-            found += options_of(typing.cast(type, kind), None if default is MISSING else default, inner, here)
+            found += options_of(
+                typing.cast(type, kind), None if default is MISSING else default, inner, here
+            )
         else:
-            found.append(Option(one.metadata.get("flag", prefix + one.name), here, kind, default, one.metadata))
+            found.append(
+                Option(
+                    one.metadata.get("flag", prefix + one.name), here, kind, default, one.metadata
+                )
+            )
     return found
 
 
@@ -135,7 +170,8 @@ def default_of(one: dataclasses.Field[Any], base: Any = None) -> Any:
 def to_plain(options: Any) -> dict[str, Any]:
     """Return a command's options as a tree of plain YAML values, keyed by option names.
 
-    Omits what concerns one call alone, so that a file made from it never replaces or continues another output.
+    Omits what concerns one call alone, so that a file made from it never replaces or continues
+    another output.
     """
     tree: dict[str, Any] = {}
     for one in options_of(type(options)):
@@ -168,7 +204,9 @@ def word(value: Any) -> str:
 
 
 def metavar(option_type: Any) -> str:
-    """Return the placeholder of a value in help and errors: `INT`, `PATH`, `mse|l1`, `FLOAT,...`."""
+    """Return the placeholder of a value in help and errors: `INT`, `PATH`, `mse|l1`,
+    `FLOAT,...`.
+    """
     option_type = without_none(option_type)
     if typing.get_origin(option_type) is list:
         return f"{metavar(typing.get_args(option_type)[0])},..."
@@ -178,7 +216,9 @@ def metavar(option_type: Any) -> str:
 
 
 def from_word(option_type: Any, word: str) -> Any:
-    """Return the value of a command-line word: None for `null`, texts for a list type, else the word itself."""
+    """Return the value of a command-line word: None for `null`, texts for a list type, else the
+    word itself.
+    """
     some = without_none(option_type)
     if some != option_type and word in ("null", "none"):
         return None
@@ -189,9 +229,12 @@ def from_word(option_type: Any, word: str) -> Any:
 
 
 def decode(option_type: Any, value: Any) -> Any:
-    """Convert `value`, from YAML or text, to the declared type; raises one of several errors if it is invalid.
+    """Convert `value`, from YAML or text, to the declared type.
 
-    Unlike draccus, refuses a boolean as a number or text, NaN as a number, and "" as a path (the current folder).
+    Raises one of several errors if it is invalid.
+
+    Unlike draccus, refuses a boolean as a number or text, NaN as a number, and "" as a path (the
+    current folder).
     """
     import draccus  # imported here because help does not need it
 
@@ -205,13 +248,19 @@ def decode(option_type: Any, value: Any) -> Any:
     if some == NameOrPath:
         return typed(_expand(draccus.decode(str, value)))
     decoded: Any = draccus.decode(option_type, value)
-    if decoded != decoded or (isinstance(value, bool) and some is not bool) or (some is Path and value == ""):
+    if (
+        decoded != decoded
+        or (isinstance(value, bool) and some is not bool)
+        or (some is Path and value == "")
+    ):
         raise ValueError
     return [_expand(item) for item in decoded] if isinstance(decoded, list) else _expand(decoded)
 
 
 def _expand(value: Any) -> Any:
-    """Expand the tilde in a path, such as `~/x`, `carry:~/x` and `mesh:~/x`: shells do so only in a word of its own."""
+    """Expand the tilde in a path, such as `~/x`, `carry:~/x` and `mesh:~/x`: shells do so only
+    in a word of its own.
+    """
     if isinstance(value, str):
         return re.sub(r"^(\w+:)?~/", lambda found: f"{found[1] or ''}{Path.home()}/", value)
     return value.expanduser() if isinstance(value, Path) else value
@@ -221,7 +270,9 @@ def without_none(option_type: Any) -> Any:
     """Return `X` of `X | None`, and any other type as it is."""
     if typing.get_origin(option_type) not in (Union, types.UnionType):
         return option_type
-    return functools.reduce(operator.or_, (one for one in typing.get_args(option_type) if one is not types.NoneType))
+    return functools.reduce(
+        operator.or_, (one for one in typing.get_args(option_type) if one is not types.NoneType)
+    )
 
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
@@ -239,7 +290,9 @@ class _Value(NamedTuple):
 
 
 def parse[T](cls: type[T], words: Sequence[str], command: str = "COMMAND") -> T:
-    """Read options from the command line; `UsageError` for an unknown name, or an invalid or missing value.
+    """Read options from the command line.
+
+    `UsageError` for an unknown name, or an invalid or missing value.
 
     command: the command's name, for error messages.
     """
@@ -256,10 +309,13 @@ def from_yaml[T](path: Path, cls: type[T]) -> T:
     return from_layers(cls, [(str(path), read_yaml(path, _EXPECTED))])
 
 
-def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str, _Value] | None = None) -> T:
+def from_layers[T](
+    cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str, _Value] | None = None
+) -> T:
     """Read options from trees of YAML; later trees override earlier ones, and `words` override all.
 
-    layers: pairs (origin, tree); error messages name the origin. Raises `UsageError` as `parse` does.
+    layers: pairs (origin, tree); error messages name the origin. Raises `UsageError` as `parse`
+    does.
     """
     known = {option.name: option for option in options_of(cls)}
     raw = dict[str, _Value]()
@@ -269,8 +325,11 @@ def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Any]], words: Mappi
     for name, one in (raw | dict(words or {})).items():
         option = one.option
         if option.is_open:
-            values[option.path] = values.get(option.path, {}) | {name.removeprefix(f"{option.name}."): _decode(one)}
-        elif one.value is not None or without_none(option.type) != option.type:  # other nulls mean the default
+            values[option.path] = values.get(option.path, {}) | {
+                name.removeprefix(f"{option.name}."): _decode(one)
+            }
+        # other nulls mean the default
+        elif one.value is not None or without_none(option.type) != option.type:
             values[option.path] = _decode(one)
     for option in known.values():
         if option.default is MISSING and values.get(option.path, MISSING) is MISSING:
@@ -285,7 +344,8 @@ def check_paths(options: Any) -> None:
         for path in value if isinstance(value, list) else [value]:
             if path is not None and not path.exists():
                 raise UsageError(
-                    f"{path} does not exist; expected {one.metadata['help']}{hub_hint(path, one.metadata['exists'])}"
+                    f"{path} does not exist; expected"
+                    f" {one.metadata['help']}{hub_hint(path, one.metadata['exists'])}"
                 )
 
 
@@ -303,7 +363,8 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _
     places = [option for option in known.values() if option.positional]
     for number, word in enumerate(words):
         name, equals, value = word[2:].partition("=")
-        if word == "--" and places and places[-1].is_list:  # the rest is another program's command line
+        # the rest is another program's command line
+        if word == "--" and places and places[-1].is_list:
             raw[places[-1].name] = _Value(places[-1], list(words[number + 1 :]), places[-1].label)
             break
         if word.startswith("--"):
@@ -313,7 +374,9 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _
                 raise _unknown_option("option", name, known, "--", command)
             kind = Any if option.is_open else option.type
             if not equals and kind is not bool:
-                raise UsageError(f"--{name} has no value; write --{name}=VALUE, expected {metavar(kind)}")
+                raise UsageError(
+                    f"--{name} has no value; write --{name}=VALUE, expected {metavar(kind)}"
+                )
             raw[name] = _Value(option, from_word(kind, value if equals else "true"), f"--{name}")
         elif not places or word.startswith("-"):
             wanted = f"write options as --name=value; manip-il {command} --help=all lists them"
@@ -329,7 +392,9 @@ def _find(name: str, known: Known) -> Option | None:
     """Return the option of a name, or the open group that it is in."""
     if name in known and not known[name].is_open:
         return known[name]
-    return next((one for one in known.values() if one.is_open and name.startswith(f"{one.name}.")), None)
+    return next(
+        (one for one in known.values() if one.is_open and name.startswith(f"{one.name}.")), None
+    )
 
 
 def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[str, _Value]:
@@ -343,7 +408,9 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
         if option := _find(name, known):
             raw[name] = _Value(option, value, f"{origin}: {name}")
             if value is not None and option.metadata.get("command_line_only"):
-                raise UsageError(f"{origin}: {name} can only be set on the command line; give --{name}=...")
+                raise UsageError(
+                    f"{origin}: {name} can only be set on the command line; give --{name}=..."
+                )
         elif any(other == name or other.startswith(f"{name}.") for other in known):
             raw |= _read_tree(value, known, origin, f"{name}.")
         else:
@@ -360,7 +427,9 @@ def _build(cls: Any, values: Mapping[tuple[str, ...], Any], path: tuple[str, ...
             raw = {inner[-1]: value for inner, value in values.items() if inner[:-1] == here}
             arguments[declared.name] = default_of(declared) | raw
         else:
-            arguments[declared.name] = _build(kind, values, here) if dataclasses.is_dataclass(kind) else values[here]
+            arguments[declared.name] = (
+                _build(kind, values, here) if dataclasses.is_dataclass(kind) else values[here]
+            )
     return cls(**arguments)
 
 
@@ -373,16 +442,22 @@ def _decode(one: _Value) -> Any:
     except ManipError:  # from a class with its own `parse`
         raise
     except Exception:  # draccus also raises plain Exception
-        raise UsageError(f"{one.origin}: expected {metavar(kind)}, got {shorten(one.value)}") from None
+        raise UsageError(
+            f"{one.origin}: expected {metavar(kind)}, got {shorten(one.value)}"
+        ) from None
     check_bound(one.origin, value, one.option.metadata)
     return value
 
 
 def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: str) -> UsageError:
-    """Return the error for an unknown option or key, with the nearest names and the command that lists all.
+    """Return the error for an unknown option or key, with the nearest names and the command that
+    lists all.
 
-    `num_episodes` finds `dataset.num_episodes`. kind: `option`, or `key in FILE:`. dashes: prefix of the names.
+    `num_episodes` finds `dataset.num_episodes`. kind: `option`, or `key in FILE:`. dashes: prefix
+    of the names.
     """
     named = [one.label.replace("--", dashes) for one in known.values() if not one.positional]
     near = nearest(dashes + name, named, _MOST_OFFERED)
-    return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; manip-il {command} --help=all lists all")
+    return UsageError(
+        f"unknown {kind} {shorten(dashes + name)}{near}; manip-il {command} --help=all lists all"
+    )

@@ -1,4 +1,6 @@
-"""Output of commands: lines, warnings, and progress (a bar on a terminal, else a line every 5 seconds)."""
+"""Output of commands: lines, warnings, and progress (a bar on a terminal, else a line every 5
+seconds).
+"""
 
 from __future__ import annotations
 
@@ -86,11 +88,12 @@ _PLAIN: dict[str, Any] = {
 class Stages(Progress):
     """Progress of work in stages, each a number of steps; use as a context manager.
 
-    Shows a bar on a terminal, else lines like `record: 12/50 (3.40/s, success=0.92)`; nothing if progress is switched
-    off. The first Ctrl-C or SIGTERM stops the work after the current step, the second at once.
+    Shows a bar on a terminal, else lines like `record: 12/50 (3.40/s, success=0.92)`; nothing if
+    progress is switched off. The first Ctrl-C or SIGTERM stops the work after the current step, the
+    second at once.
 
-    kept: what is saved and can be resumed, for the message if the work is interrupted or fails. prepare: prepares the
-    output when the inputs have been checked.
+    kept: what is saved and can be resumed, for the message if the work is interrupted or fails.
+    prepare: prepares the output when the inputs have been checked.
     """
 
     def __init__(self, kept: str = "", prepare: Callable[[], None] | None = None):
@@ -103,7 +106,9 @@ class Stages(Progress):
         self._solved = 0
 
     def __enter__(self) -> Stages:
-        self._handlers = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._handlers = {
+            number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)
+        }
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
@@ -146,7 +151,9 @@ class Stages(Progress):
 
     @override
     def step(self, n: int = 1, **numbers: float) -> None:
-        """Count `n` steps. numbers: shown beside the bar (loss=0.12, success=0.9) until replaced."""
+        """Count `n` steps. numbers: shown beside the bar (loss=0.12, success=0.9) until
+        replaced.
+        """
         if self._bar is not None:
             if numbers:
                 self._bar.set_postfix(numbers, refresh=False)

@@ -1,8 +1,10 @@
-"""`manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun if there is no display.
+"""`manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun if there is no
+display.
 
 `manip-il serve`: a virtual SO-101 behind serial ports, for LeRobot's own programs.
 
-`manip-il robot new`, `check`, `certify`: a YAML file for your own arm, and what the arm and its expert can do.
+`manip-il robot new`, `check`, `certify`: a YAML file for your own arm, and what the arm and its
+expert can do.
 """
 
 from dataclasses import MISSING, dataclass, field
@@ -26,17 +28,20 @@ class WatchedPolicyGroup:
 
     path: Path | None = option(None, "a checkpoint or a run")
     type: Literal["expert", "random", "sliders"] | None = option(
-        None, "who drives instead of a checkpoint, by default the expert; sliders: you, in the window"
+        None,
+        "who drives instead of a checkpoint, by default the expert; sliders: you, in the window",
     )
 
 
 @dataclass(frozen=True)
 class ViewOptions(Tested, Seeded, Trusting):
-    """Watch a robot at its task in MuJoCo's viewer; without a display, in a browser (Rerun) or from a file.
+    """Watch a robot at its task in MuJoCo's viewer.
 
-    Episodes run in real time until --n_episodes have ended, the window is closed or Ctrl-C is pressed. The browser
-    shows pictures, joints, actions, phase and progress. --output writes these as fast as possible to a file, which
-    `rerun FILE.rrd` opens on any machine.
+    Without a display, in a browser (Rerun) or from a file.
+
+    Episodes run in real time until --n_episodes have ended, the window is closed or Ctrl-C is
+    pressed. The browser shows pictures, joints, actions, phase and progress. --output writes these
+    as fast as possible to a file, which `rerun FILE.rrd` opens on any machine.
 
     Example: manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd
     """
@@ -44,24 +49,29 @@ class ViewOptions(Tested, Seeded, Trusting):
     first: ClassVar[str] = "policy.path policy.type robot.type task.type n_episodes output"
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
-    n_episodes: int | None = option(None, f"episodes; by default unlimited, or {IN_A_FILE} with --output", at_least=1)
+    n_episodes: int | None = option(
+        None, f"episodes; by default unlimited, or {IN_A_FILE} with --output", at_least=1
+    )
     output: Path | None = option(None, "write a Rerun file, FILE.rrd, instead of showing episodes")
 
 
 @dataclass(frozen=True)
 class ServeOptions(Varied, Trusting):
-    """Run a simulated SO-101 behind serial ports, which LeRobot's own programs open like those of a real arm.
+    """Run a simulated SO-101 behind serial ports, which LeRobot's own programs open like those of a
+    real arm.
 
-    Prints both ports, the cameras, and a command line to copy. With `-- COMMAND ...` it runs that program on the ports
-    and presses its keys as a person would: an episode ends when the task is solved, and a failed one is recorded
-    again. --vary=servo also varies the servos. A policy as the leader (--leader=runs/lift) sets the default task and
-    cameras.
+    Prints both ports, the cameras, and a command line to copy. With `-- COMMAND ...` it runs that
+    program on the ports and presses its keys as a person would: an episode ends when the task is
+    solved, and a failed one is recorded again. --vary=servo also varies the servos. A policy as the
+    leader (--leader=runs/lift) sets the default task and cameras.
 
     Example: manip-il serve --task.type=lift --cameras=front,wrist
     """
 
     first: ClassVar[str] = "task.type cameras leader servo log output_dir"
-    command: list[str] = option(list, "a LeRobot program and its options, after `--`", positional=True)
+    command: list[str] = option(
+        list, "a LeRobot program and its options, after `--`", positional=True
+    )
     env: Given = given(EnvConfig, robot="so101")
     session: Given = given(SessionConfig, prefix="")
     servos: ServoConfig = field(default_factory=ServoConfig)
@@ -69,11 +79,13 @@ class ServeOptions(Varied, Trusting):
 
 @dataclass(frozen=True)
 class RobotNewOptions(Replacing):
-    """Write a first YAML file for an arm's MJCF, with hand, fingers and workspace as suggested by the model.
+    """Write a first YAML file for an arm's MJCF, with hand, fingers and workspace as suggested by
+    the model.
 
-    Comments in the file explain its values. Joints, home, gains and the hand's frame are not in it: they are taken from
-    the model unless you add them. Then checks the robot, like `robot check --episodes=0`, and prints what to change.
-    The exit code is 1 if the robot cannot do any task yet.
+    Comments in the file explain its values. Joints, home, gains and the hand's frame are not in it:
+    they are taken from the model unless you add them. Then checks the robot, like `robot check
+    --episodes=0`, and prints what to change. The exit code is 1 if the robot cannot do any task
+    yet.
 
     Example: manip-il robot new my_arm.xml --output=my_arm.yaml
     """
@@ -87,13 +99,16 @@ class RobotNewOptions(Replacing):
 class RobotCheckOptions(Output):
     """Measure what an arm can do, before recording; writes check.html and check.json.
 
-    Shows the arm with its hand frame and cameras, its reach, the expert's success at every task (also with a tenth of
-    its actions random), and what to change if something does not work. The exit code is 1 if a task cannot be done.
+    Shows the arm with its hand frame and cameras, its reach, the expert's success at every task
+    (also with a tenth of its actions random), and what to change if something does not work. The
+    exit code is 1 if a task cannot be done.
 
     Example: manip-il robot check my_arm.yaml --tasks=reach,pick_place --output_dir=runs/my_arm
     """
 
-    robot: NameOrPath = option(MISSING, "the robot's YAML file, or the name of a built-in robot", positional=True)
+    robot: NameOrPath = option(
+        MISSING, "the robot's YAML file, or the name of a built-in robot", positional=True
+    )
     tasks: list[str] = option(list, f"any of {', '.join(NAMES)}; by default all")
     episodes: int = option(
         50,
@@ -106,12 +121,16 @@ class RobotCheckOptions(Output):
 
 @dataclass(frozen=True)
 class CertifyOptions(Seeded, EngineOptions, Output):
-    """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json.
+    """Measure how the expert recovers from perturbed states and wrong actions.
+
+    Writes certificate.json.
 
     Example: manip-il robot certify --task.type=stack --output_dir=runs/certificate
     """
 
     first: ClassVar[str] = "robot.type task.type cases output_dir"
     env: Given = given(EnvConfig)
-    cases: int = option(500, "episodes for each kind of perturbation", at_least=1, at_most=1_000_000)
+    cases: int = option(
+        500, "episodes for each kind of perturbation", at_least=1, at_most=1_000_000
+    )
     output_dir: Path = output_folder("runs/certificate")

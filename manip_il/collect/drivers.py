@@ -1,7 +1,8 @@
-"""Drivers of rollouts: the expert, the expert with noise, a policy, a mixture of policy and expert, random actions.
+"""Drivers of rollouts: the expert, the expert with noise, a policy, a mixture of policy and expert,
+random actions.
 
-A driver is a small picklable object that a job sends to its worker. In the worker, `start` returns a function that maps
-the turns of a step to an action (n,) and an actor for each turn.
+A driver is a small picklable object that a job sends to its worker. In the worker, `start` returns
+a function that maps the turns of a step to an action (n,) and an actor for each turn.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
 class Setting:
     """What a driver or query rule knows about its rollouts.
 
-    actions: the robot's action space. horizon: control steps per episode. policies: the driver's loaded policies.
+    actions: the robot's action space. horizon: control steps per episode. policies: the driver's
+    loaded policies.
     """
 
     actions: ActionSpace
@@ -70,7 +72,9 @@ class ExpertDriver(Driver):
 
 @dataclass(frozen=True)
 class NoisyExpertDriver(Driver):
-    """Executes the expert's label plus Gaussian noise: DART (Laskey et al. 2017). covariance: the noise's, (n, n)."""
+    """Executes the expert's label plus Gaussian noise: DART (Laskey et al. 2017). covariance:
+    the noise's, (n, n).
+    """
 
     covariance: tuple[tuple[float, ...], ...]
     kind = "noisy_expert"
@@ -89,22 +93,28 @@ class NoisyExpertDriver(Driver):
 
 @dataclass(frozen=True)
 class RandomDriver(Driver):
-    """Draws joint targets uniformly within the longest step from the measured joints, and any gripper opening."""
+    """Draws joint targets uniformly within the longest step from the measured joints, and any
+    gripper opening.
+    """
 
     kind = "random"
 
     @override
     def start(self, setting: Setting) -> Act:
         draw, rngs = setting.actions.random_near, generators("random policy")
-        return lambda turns: [(draw(turn.observation.state, rngs(turn.seed)), Actor.LEARNER) for turn in turns]
+        return lambda turns: [
+            (draw(turn.observation.state, rngs(turn.seed)), Actor.LEARNER) for turn in turns
+        ]
 
 
 @dataclass(frozen=True)
 class PolicyDriver(Driver):
-    """Executes the policy's action, or with probability beta the expert's: pi_i = beta pi* + (1 - beta) pi_hat.
+    """Executes the policy's action, or with probability beta the expert's: pi_i = beta pi* + (1 -
+    beta) pi_hat.
 
-    policies: the first one drives; a query rule may compare the others with it. trust: whether to load models
-    and code that the checkpoints name. device: torch device of the policies. (Ross et al. 2011)
+    policies: the first one drives; a query rule may compare the others with it. trust: whether to
+    load models and code that the checkpoints name. device: torch device of the policies. (Ross et
+    al. 2011)
     """
 
     kind = "policy"
@@ -115,7 +125,9 @@ class PolicyDriver(Driver):
 
     @classmethod
     def of(cls, *policies: Checkpoint | Path, **settings: Any) -> PolicyDriver:
-        """Return the driver of checkpoints, or of `pretrained_model` folders, which are opened here."""
+        """Return the driver of checkpoints, or of `pretrained_model` folders, which are opened
+        here.
+        """
         opened = (one if isinstance(one, Checkpoint) else Checkpoint.open(one) for one in policies)
         return cls(tuple(opened), **settings)
 
@@ -144,12 +156,18 @@ def expert_actions(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
 
 
 def policy_actions(policy: LearnedPolicy, turns: Sequence[Turn]) -> F64:
-    """Return a policy's action in every turn, (B, n); its memory is reset when an episode starts."""
+    """Return a policy's action in every turn, (B, n).
+
+    Its memory is reset when an episode starts.
+    """
     if started := {turn.seed: turn.observation.instruction for turn in turns if turn.step == 0}:
         policy.begin(started)
     seen = [turn.observation for turn in turns]
     pictures = {camera: np.stack([one.images[camera] for one in seen]) for camera in policy.cameras}
-    states = (np.stack([one.state for one in seen]), np.stack([one.environment_state for one in seen]))
+    states = (
+        np.stack([one.state for one in seen]),
+        np.stack([one.environment_state for one in seen]),
+    )
     return policy.act(*states, pictures, [turn.seed for turn in turns])
 
 

@@ -1,9 +1,10 @@
 """Make a new dataset from the stored states of another, with new labels, pictures or scenes.
 
-The edits `relabel`, `render` and `redraw` process the source in pieces, in local processes, and write a dataset that
-appears when it is complete.
+The edits `relabel`, `render` and `redraw` process the source in pieces, in local processes, and
+write a dataset that appears when it is complete.
 
-New scenes from visited states: randomise goals, untouched objects and appearance, then label and render.
+New scenes from visited states: randomise goals, untouched objects and appearance, then label and
+render.
 
 The expert is a function of the state, so it can label scenes that were never visited.
 """
@@ -36,7 +37,14 @@ from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.table import described_env, env_fingerprint, env_spec, make_env, make_expert, stored_config
+from manip_il.worlds.table import (
+    described_env,
+    env_fingerprint,
+    env_spec,
+    make_env,
+    make_expert,
+    stored_config,
+)
 
 CHUNK = 25  # scenes that one worker draws at a time
 _TRIES = 5  # scenes drawn for a state before the visited scene itself is used
@@ -46,10 +54,10 @@ _TRIES = 5  # scenes drawn for a state before the visited scene itself is used
 class Scenes:
     """How scenes are drawn from a dataset's states. cameras: None for scenes without pictures.
 
-    anew: whether to also randomise goals and objects, not only appearance. conditions: ranges of the appearance and
-    of the observations' noise. branch_steps: control steps that the expert drives from every state, for policies that
-    predict chunks. first: number of the first scene in the random stream, so that datasets redrawn with the same seed
-    can differ.
+    anew: whether to also randomise goals and objects, not only appearance. conditions: ranges of
+    the appearance and of the observations' noise. branch_steps: control steps that the expert
+    drives from every state, for policies that predict chunks. first: number of the first scene in
+    the random stream, so that datasets redrawn with the same seed can differ.
     """
 
     cameras: CameraConfig | None
@@ -62,14 +70,18 @@ class Scenes:
 
     @property
     def numbers(self) -> range:
-        """Numbers of the scenes in the random stream. Raises `UsageError` if the stream has too few."""
+        """Numbers of the scenes in the random stream.
+
+        Raises `UsageError` if the stream has too few.
+        """
         return stream_seeds("redraw", self.first + self.frames, self.seed)[self.first :]
 
     def chunks(self, states: F64, leads: F64) -> Iterator[tuple[int, F64, F64]]:
-        """Yield, for every `CHUNK` scenes, the number of the first scene, the visited states and their label offsets.
+        """Yield, for every `CHUNK` scenes, the number of the first scene, the visited states and
+        their label offsets.
 
-        states: rows of `sim_state` (S, m), used in an order drawn from the seed, repeatedly if scenes outnumber them.
-        leads: offset added to the label of each state's scene, (S, n).
+        states: rows of `sim_state` (S, m), used in an order drawn from the seed, repeatedly if
+        scenes outnumber them. leads: offset added to the label of each state's scene, (S, n).
         """
         order = rng_for(self.seed, "order of redrawn states").permutation(len(states))
         for at in range(0, self.frames, CHUNK):
@@ -87,11 +99,16 @@ class SceneDrawer:
         self._expert = make_expert(config)
         self._scenes = scenes
 
-    def frames(self, visited: State, number: int, seed: int, lead: F64 | float = 0.0) -> list[Transition]:
-        """Return the frames of a new scene: one labelled frame, or the frames of a branch; [] without a valid label.
+    def frames(
+        self, visited: State, number: int, seed: int, lead: F64 | float = 0.0
+    ) -> list[Transition]:
+        """Return the frames of a new scene: one labelled frame, or the frames of a branch.
 
-        visited: the state that is changed into the scene. number: scene number in the random stream. seed: value of the
-        `seed` column. lead: offset added to the label of a single frame, (n,).
+        [] without a valid label.
+
+        visited: the state that is changed into the scene. number: scene number in the random
+        stream. seed: value of the `seed` column. lead: offset added to the label of a single frame,
+        (n,).
         """
         rng = rng_for(number, "redraw")
         if self._has_noise:
@@ -115,14 +132,26 @@ class SceneDrawer:
         env, action = self._env, label.action
         env.set_state(state)
         return Transition(
-            seed, state.step, state, env.observe(), label, action, Actor.EXPERT, 0.0, False, True, env.progress
+            seed,
+            state.step,
+            state,
+            env.observe(),
+            label,
+            action,
+            Actor.EXPERT,
+            0.0,
+            False,
+            True,
+            env.progress,
         )
 
 
 Columns = dict[str, NDArray[Any]]
 _COMPARED = ("model_sha256", "mujoco")  # entries of a fingerprint that affect restored states
 SERVED = "lerobot"  # `driver` of datasets recorded by LeRobot's programs from our servos
-NOTICEABLE = 0.01  # smallest change of a label that counts, relative to a joint's longest step or the gripper's opening
+# smallest change of a label that counts, relative to a joint's longest step or the gripper's
+# opening
+NOTICEABLE = 0.01
 
 
 @dataclass(frozen=True)
@@ -137,9 +166,14 @@ class EditSource:
     warnings: tuple[str, ...] = ()
 
     def check_has_no_sag(self, what: str) -> None:
-        """Raise `ManipError` if the labels hold the sag of `serve`'s servos. what: an edit that would drop it."""
+        """Raise `ManipError` if the labels hold the sag of `serve`'s servos. what: an edit that
+        would drop it.
+        """
         if _is_served(self.dataset.provenance):
-            raise ManipError(f"the labels in {self.dataset.root} hold the sag of serve's servos; {what} would drop it")
+            raise ManipError(
+                f"the labels in {self.dataset.root} hold the sag of serve's servos; {what} would"
+                " drop it"
+            )
 
 
 def open_source(
@@ -150,22 +184,26 @@ def open_source(
 ) -> EditSource:
     """Open a dataset whose states are to be restored.
 
-    robot, task, shape: as in `EnvConfig`, for a robot, a task or a mesh of the user's own.
-    Raises `ManipError` if the folder is not a dataset of ours, `MismatchError` if it is for another robot, task or
-    object, and what `stored_config` raises for a robot, task or object that is not built in.
+    robot, task, shape: as in `EnvConfig`, for a robot, a task or a mesh of the user's own. Raises
+    `ManipError` if the folder is not a dataset of ours, `MismatchError` if it is for another robot,
+    task or object, and what `stored_config` raises for a robot, task or object that is not built
+    in.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
     if spec.task == UNKNOWN_TASK:
         raise ManipError(
-            f"{root} has no {OURS}, which LeRobot's tools drop: copy it from the dataset that this one was made from"
+            f"{root} has no {OURS}, which LeRobot's tools drop: copy it from the dataset that this"
+            " one was made from"
         )
     env = stored_config(spec, robot, task, shape)
     given = env_spec(env)
     given.require("restored", "record again what you need")
     for what in ("robot", "task", "object", "sim_state_size"):
         if getattr(given, what) != getattr(spec, what):
-            raise MismatchError(what, str(root), getattr(spec, what), f"the given {what}", getattr(given, what))
+            raise MismatchError(
+                what, str(root), getattr(spec, what), f"the given {what}", getattr(given, what)
+            )
     here, there = env_fingerprint(env), dataset.fingerprint
     left, right = ({key: one.get(key, "nothing") for key in _COMPARED} for one in (there, here))
     warnings = compare_fingerprints(str(root), left, "this machine", right)
@@ -186,15 +224,19 @@ class EditTarget:
 
 
 def relabel_dataset(source: EditSource, target: EditTarget) -> int:
-    """Write `source` with the expert's label of every state; all other columns and pictures stay the same.
+    """Write `source` with the expert's label of every state.
 
-    States in which the expert was not queried get a label, too. Returns the number of frames whose label changed: its
-    action by more than `NOTICEABLE`, its phase, or its validity. Raises what `Dataset.stored_episodes` and
-    `write_episodes` raise, and `ManipError` if a worker dies.
+    All other columns and pictures stay the same.
+
+    States in which the expert was not queried get a label, too. Returns the number of frames whose
+    label changed: its action by more than `NOTICEABLE`, its phase, or its validity. Raises what
+    `Dataset.stored_episodes` and `write_episodes` raise, and `ManipError` if a worker dies.
     """
     source.check_has_no_sag("data relabel")
     scale, dataset = described_env(source.env).actions.scale, source.dataset
-    simulated = {key: value for key, value in dataset.fingerprint.items() if key.endswith("_sha256")}
+    simulated = {
+        key: value for key, value in dataset.fingerprint.items() if key.endswith("_sha256")
+    }
     fingerprint = {**env_fingerprint(source.env), **simulated}
     own = Own(dataset.spec, fingerprint, {**dataset.provenance, "relabelled": _origin(source)})
     _rewrite(source, target, partial(label_states, source.env), own, dataset.stored_features)
@@ -203,15 +245,24 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
 
 
 def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget) -> Info:
-    """Write `source` with the pictures of these cameras instead of its own; all other columns stay the same.
+    """Write `source` with the pictures of these cameras instead of its own.
 
-    Raises `RenderError` if there is no OpenGL, and what `Dataset.stored_episodes` and `write_episodes` raise.
+    All other columns stay the same.
+
+    Raises `RenderError` if there is no OpenGL, and what `Dataset.stored_episodes` and
+    `write_episodes` raise.
     """
     dataset, here = source.dataset, env_spec(source.env, cameras)
-    spec = replace(dataset.spec, cameras=here.cameras, image_size=here.image_size, keypoints=here.keypoints)
+    spec = replace(
+        dataset.spec, cameras=here.cameras, image_size=here.image_size, keypoints=here.keypoints
+    )
     look = env_fingerprint(source.env, cameras)["cameras_sha256"]
     rendered = {"from": dataset.root.name, "cameras": asdict(cameras)}
-    own = Own(spec, {**dataset.fingerprint, "cameras_sha256": look}, {**dataset.provenance, "rendered": rendered})
+    own = Own(
+        spec,
+        {**dataset.fingerprint, "cameras_sha256": look},
+        {**dataset.provenance, "rendered": rendered},
+    )
     ours = schema.features(dataset.spec)
     others = {key: one for key, one in dataset.stored_features.items() if key not in ours}
     work = partial(render_states, source.env, cameras)
@@ -219,10 +270,12 @@ def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget
 
 
 def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> Info:
-    """Write a dataset of new scenes made from the states of `source`; each frame or branch is an episode.
+    """Write a dataset of new scenes made from the states of `source`.
 
-    The same seed gives the same scenes; a larger number of frames only adds scenes at the end. Raises
-    `NothingToLearnError` if no scene has a valid label.
+    Each frame or branch is an episode.
+
+    The same seed gives the same scenes; a larger number of frames only adds scenes at the end.
+    Raises `NothingToLearnError` if no scene has a valid label.
     """
     if scenes.branch_steps > 1:
         source.check_has_no_sag("--branch_steps")
@@ -237,7 +290,11 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
         "branch_steps": scenes.branch_steps,
         "cameras": scenes.cameras and asdict(scenes.cameras),
     }
-    vary = {"vary": [condition.to_json() for condition in scenes.conditions]} if scenes.conditions else {}
+    vary = (
+        {"vary": [condition.to_json() for condition in scenes.conditions]}
+        if scenes.conditions
+        else {}
+    )
     seeds = scenes.numbers[::CHUNK]
     tried = {"seeds": [seeds[0], seeds[-1]], "tried": len(seeds)}
     provenance = {"redrawn": {**_origin(source), **drawn, **vary}, **tried}
@@ -252,16 +309,33 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
             empty = empty and not found
             target.on_piece()
         if empty:
-            raise NothingToLearnError("no scene has a valid expert label, so there is nothing to learn from")
+            raise NothingToLearnError(
+                "no scene has a valid expert label, so there is nothing to learn from"
+            )
 
-    with closing(map_in_order(partial(_draw_scenes, source.env, scenes), pieces, target.workers)) as made:
-        return write_dataset(episodes(), target.root, spec, provenance, replace=target.replace, fingerprint=fingerprint)
+    with closing(
+        map_in_order(partial(_draw_scenes, source.env, scenes), pieces, target.workers)
+    ) as made:
+        return write_dataset(
+            episodes(),
+            target.root,
+            spec,
+            provenance,
+            replace=target.replace,
+            fingerprint=fingerprint,
+        )
 
 
 def _rewrite(
-    source: EditSource, target: EditTarget, work: Callable[[NDArray[Any]], Columns], own: Own, features: Features
+    source: EditSource,
+    target: EditTarget,
+    work: Callable[[NDArray[Any]], Columns],
+    own: Own,
+    features: Features,
 ) -> Info:
-    """Write `source` with the columns that workers make from each episode's states, (T, m). features: of the target."""
+    """Write `source` with the columns that workers make from each episode's states, (T, m).
+    features: of the target.
+    """
     dataset = source.dataset
 
     def episodes() -> Iterator[EpisodeData]:
@@ -269,16 +343,25 @@ def _rewrite(
             target.on_piece()
             yield replace(one, columns={**one.columns, **found})
 
-    states = (np.asarray(one.columns[schema.SIM_STATE]) for one in dataset.stored_episodes([schema.SIM_STATE]))
+    states = (
+        np.asarray(one.columns[schema.SIM_STATE])
+        for one in dataset.stored_episodes([schema.SIM_STATE])
+    )
     about = dataset.fps, dataset.info.robot, own
     with closing(map_in_order(work, states, target.workers)) as made:
         return write_episodes(
-            episodes(), target.root, features, *about, tables=dataset.other_tables, replace=target.replace
+            episodes(),
+            target.root,
+            features,
+            *about,
+            tables=dataset.other_tables,
+            replace=target.replace,
         )
 
 
 def label_states(env: EnvConfig, states: NDArray[Any]) -> Columns:
-    """Return the expert's labels of states, rows of `sim_state` (T, m), as columns of a dataset, (T,) or (T, n).
+    """Return the expert's labels of states, rows of `sim_state` (T, m), as columns of a dataset,
+    (T,) or (T, n).
 
     If a label is invalid, its action holds the arm still and `label_valid` is 0.
     """
@@ -296,15 +379,19 @@ def _labels(env: EnvConfig, states: NDArray[Any]) -> list[Label]:
 
 
 def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -> Columns:
-    """Render states, rows of `sim_state` (T, m), to columns: pictures (T, height, width, 3), keypoints (T, 3 K).
+    """Render states, rows of `sim_state` (T, m), to columns: pictures (T, height, width, 3),
+    keypoints (T, 3 K).
 
-    The values are bit-equal to what an environment with these cameras observes. Raises `RenderError` without OpenGL.
+    The values are bit-equal to what an environment with these cameras observes. Raises
+    `RenderError` without OpenGL.
     """
     view = make_env(env, cameras)
     spec = env_spec(env, cameras)
     rows = len(states)
     found: Columns = {key: np.empty((rows, *cameras.size, 3), np.uint8) for key in spec.image_keys}
-    found |= {key: np.empty((rows, 3 * len(spec.keypoints)), np.float32) for key in spec.keypoint_keys}
+    found |= {
+        key: np.empty((rows, 3 * len(spec.keypoints)), np.float32) for key in spec.keypoint_keys
+    }
     for row, state in enumerate(states):
         view.set_state(State.from_vector(state))
         seen = view.observe()
@@ -317,12 +404,17 @@ def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -
 
 def _count_changed(before: Columns, after: Columns, scale: F64) -> int:
     gaps = (np.abs(before[schema.ACTION] - after[schema.ACTION]) / scale).max(axis=1)
-    same = (before[key].ravel() == after[key].ravel() for key in (schema.LABEL_VALID, schema.EXPERT_PHASE))
+    same = (
+        before[key].ravel() == after[key].ravel()
+        for key in (schema.LABEL_VALID, schema.EXPERT_PHASE)
+    )
     return int((~np.logical_and(*same) | (gaps > NOTICEABLE)).sum())
 
 
 def _leads(source: EditSource, columns: Columns) -> F64:
-    """Return recorded minus expert labels, (T, n): the servos' sag, if `serve --log=` wrote the dataset; else 0."""
+    """Return recorded minus expert labels, (T, n): the servos' sag, if `serve --log=` wrote the
+    dataset; else 0.
+    """
     action = columns[schema.ACTION].astype(np.float64)
     if not _is_served(source.dataset.provenance):
         return np.zeros_like(action)
@@ -333,14 +425,18 @@ def _leads(source: EditSource, columns: Columns) -> F64:
 def _is_served(provenance: Mapping[str, Any]) -> bool:
     """Whether our servos recorded a dataset, or one of those merged into it."""
     merged = provenance.get("merged", ())
-    return provenance.get("driver") == SERVED or any(_is_served(one["provenance"]) for one in merged)
+    return provenance.get("driver") == SERVED or any(
+        _is_served(one["provenance"]) for one in merged
+    )
 
 
 def _draw_scenes(env: EnvConfig, scenes: Scenes, chunk: tuple[int, F64, F64]) -> list[Episode]:
     seed, states, leads = chunk
     drawer = _drawer(env, scenes)
     rows = enumerate(zip(states, leads, strict=True))
-    made = (drawer.frames(State.from_vector(state), seed + at, seed, lead) for at, (state, lead) in rows)
+    made = (
+        drawer.frames(State.from_vector(state), seed + at, seed, lead) for at, (state, lead) in rows
+    )
     return [to_episode(frames) for frames in made if frames]
 
 

@@ -1,4 +1,6 @@
-"""What work does with its inputs: the environment that is meant, and whether datasets and policies fit it."""
+"""What work does with its inputs: the environment that is meant, and whether datasets and
+policies fit it.
+"""
 
 import logging
 from collections.abc import Mapping
@@ -18,7 +20,8 @@ _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 
 
 def env_config(given: Mapping[str, Any], origin: Origin | None = None) -> EnvConfig:
-    """Return the environment: each value as given, else as in the policy's checkpoint, else the default.
+    """Return the environment: each value as given, else as in the policy's checkpoint, else the
+    default.
 
     Raises `UnknownName` for an unknown robot or task, `UsageError` for any other invalid value.
     """
@@ -27,7 +30,8 @@ def env_config(given: Mapping[str, Any], origin: Origin | None = None) -> EnvCon
         lacking = [one for one in own_files(origin) if one[2:].partition(".")[0] not in values]
         if lacking:
             raise UsageError(
-                f"the policy is for {origin.robot} {origin.task}, of a file of your own; give {' '.join(lacking)}"
+                f"the policy is for {origin.robot} {origin.task}, of a file of your own; give"
+                f" {' '.join(lacking)}"
             )
         of_policy: dict[str, Any] = {"robot": origin.robot, "control_hz": origin.fps}
         of_policy |= {} if origin.task == UNKNOWN_TASK else {"task": origin.task}
@@ -38,7 +42,8 @@ def env_config(given: Mapping[str, Any], origin: Origin | None = None) -> EnvCon
 
 
 def own_files(spec: Any) -> list[str]:
-    """Return the options, with FILE for a path, that commands need for a robot and a task of the user's own.
+    """Return the options, with FILE for a path, that commands need for a robot and a task of the
+    user's own.
 
     spec: the `EnvironmentSpec` of a dataset or the `Origin` of a policy, which only name them.
     """
@@ -48,7 +53,10 @@ def own_files(spec: Any) -> list[str]:
 
 
 def open_dataset(root: Any) -> Dataset:
-    """Return a dataset; warn if it was made with other versions or another model, see `differences`."""
+    """Return a dataset.
+
+    Warn if it was made with other versions or another model, see `differences`.
+    """
     dataset = Dataset.open(root)
     for line in differences(dataset):
         _LOG.warning(line)
@@ -58,15 +66,16 @@ def open_dataset(root: Any) -> Dataset:
 def differences(dataset: Dataset) -> list[str]:
     """Return a line for each difference in versions or model between a dataset and this machine.
 
-    Raises `MismatchError` if joints or observations differ. A dataset of a user's own arm or task is not compared,
-    because it holds only the name of that arm or task.
+    Raises `MismatchError` if joints or observations differ. A dataset of a user's own arm or task
+    is not compared, because it holds only the name of that arm or task.
     """
     spec, name = dataset.spec, str(dataset.root)
     if world_of(spec.robot).own_files(spec.robot, spec.task, spec.object):
         return []
     env = stored_config(spec)
     check_same_spec(name, spec, "this program", env_spec(env))
-    # Tolerance and horizon do not affect learning, and a dataset does not hold them; pictures are not compared.
+    # Tolerance and horizon do not affect learning, and a dataset does not hold them; pictures are
+    # not compared.
     here = {key: value for key, value in env_fingerprint(env).items() if key not in _NOT_COMPARED}
     theirs = {key: value for key, value in dataset.fingerprint.items() if key not in _NOT_COMPARED}
     return compare_fingerprints(name, theirs, "this machine", here)
@@ -75,7 +84,8 @@ def differences(dataset: Dataset) -> list[str]:
 def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False) -> None:
     """Warn if a policy's task or model differs from `env`.
 
-    Raises `MismatchError` unless the policy can drive `env`, `ManipError` if loading it needs `trust`.
+    Raises `MismatchError` unless the policy can drive `env`, `ManipError` if loading it needs
+    `trust`.
     """
     path = str(checkpoint.path)
     origin, cameras = checkpoint.origin, checkpoint.cameras
@@ -83,18 +93,27 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
     checkpoint.check_fits(spec)
     checkpoint.require_trust(trust)
     if origin is None:
-        lines = [f"{path} was written by another tool and does not say which robot and task it is for"]
+        lines = [
+            f"{path} was written by another tool and does not say which robot and task it is for"
+        ]
     elif origin.task != spec.task:  # the model and its hash differ, too
         lines = [f"task differs: {path} has {origin.task}, the environment has {spec.task}"]
     else:
-        theirs = {name: value for name, value in origin.fingerprint.items() if cameras or name != "cameras_sha256"}
+        theirs = {
+            name: value
+            for name, value in origin.fingerprint.items()
+            if cameras or name != "cameras_sha256"
+        }
         lines = compare_fingerprints(path, theirs, "the environment", env_fingerprint(env, cameras))
     for line in lines:
         _LOG.warning(line)
 
 
 def why_not_simulated(checkpoint: Checkpoint) -> str:
-    """Return why no environment of this program fits a policy of another program's data; "" if one does."""
+    """Return why no environment of this program fits a policy of another program's data.
+
+    "" if one does.
+    """
     try:
         env = env_config({}, checkpoint.origin)
         checkpoint.check_fits(env_spec(env, checkpoint.cameras))

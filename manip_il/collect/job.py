@@ -25,7 +25,8 @@ from manip_il.worlds.table import env_spec, make_env, make_expert
 if TYPE_CHECKING:  # torch is imported only if a learner drives
     from manip_il.learn.policy import LearnedPolicy
 
-HOLD = 10  # control steps for which an episode continues after success, to see whether success lasts
+# control steps for which an episode continues after success, to see whether success lasts
+HOLD = 10
 LOCKSTEP = 25  # environments that share one call of the policy
 OWN_MODELS = 8  # lockstep limit if each environment has its own model (26 MB for the Panda)
 
@@ -34,11 +35,11 @@ OWN_MODELS = 8  # lockstep limit if each environment has its own model (26 MB fo
 class RolloutJob:
     """Driver and environment of rollouts, their length, and what is recorded.
 
-    hold: end an episode this many steps after success; None: at the horizon. patience: end it after this many steps
-    without progress. label: what the expert returns in the states that `query` selects. branch_steps: steps per
-    branch. conditions: randomisations of the world, taken in turn by seed. batch: largest number of episodes that share
-    a policy call; does not change outcomes. cameras: recorded in every step; None for none. A policy always gets the
-    pictures that it needs.
+    hold: end an episode this many steps after success; None: at the horizon. patience: end it after
+    this many steps without progress. label: what the expert returns in the states that `query`
+    selects. branch_steps: steps per branch. conditions: randomisations of the world, taken in turn
+    by seed. batch: largest number of episodes that share a policy call; does not change outcomes.
+    cameras: recorded in every step; None for none. A policy always gets the pictures that it needs.
     """
 
     env: EnvConfig
@@ -71,14 +72,19 @@ class RolloutJob:
         if not seeds:
             return
         cameras = observed_cameras(self)
-        envs = [make_env(self.env, cameras, self.conditions) for _ in range(min(self._lockstep(), len(seeds)))]
+        envs = [
+            make_env(self.env, cameras, self.conditions)
+            for _ in range(min(self._lockstep(), len(seeds)))
+        ]
         noise = [one.only("sensing") for one in self.conditions]
         branch_env = None
         if self.label == "branch":
             env_spec(self.env).require("restored", "give another --label than branch")
             branch_env = make_env(self.env, self.cameras, noise)
         steps = run_steps(self, envs, seeds)
-        for frames in group_rollouts(map(_without_pictures, steps) if self.cameras is None and cameras else steps):
+        for frames in group_rollouts(
+            map(_without_pictures, steps) if self.cameras is None and cameras else steps
+        ):
             drawn = draw(self.conditions, frames[0].seed, self.env.object)
             yield replace(self._to_episode(frames, branch_env), drawn=drawn)
 
@@ -86,11 +92,19 @@ class RolloutJob:
         """Return the number of environments that run in lockstep in one process."""
         if self.policy is None:
             return 1  # a single environment makes best use of the processor's cache
-        varies = draws_shape(self.env.object) or any(one.only("model").ranges for one in self.conditions)
-        return self.batch if env_spec(self.env).shares_model and not varies else min(self.batch, OWN_MODELS)
+        varies = draws_shape(self.env.object) or any(
+            one.only("model").ranges for one in self.conditions
+        )
+        return (
+            self.batch
+            if env_spec(self.env).shares_model and not varies
+            else min(self.batch, OWN_MODELS)
+        )
 
     def _to_episode(self, frames: list[Transition], branch_env: Environment | None) -> Episode:
-        """Return an episode from its frames, with the labels, takeover or branches that `label` asks for."""
+        """Return an episode from its frames, with the labels, takeover or branches that `label`
+        asks for.
+        """
         beta, expert = self.driver.beta, make_expert(self.env)
         if self.label == "last":
             return to_episode(frames, self.round, beta, labelled=False)
@@ -102,14 +116,18 @@ class RolloutJob:
             return to_episode(frames, self.round, beta)
         path = [replace(frame, label=None) for frame in frames]
         starts = [frame for frame in frames if frame.label is not None and frame.label.valid]
-        found = (branch(branch_env, expert, one.state, one.seed, self.branch_steps) for one in starts)
+        found = (
+            branch(branch_env, expert, one.state, one.seed, self.branch_steps) for one in starts
+        )
         return to_episode([*path, *itertools.chain(*found)], self.round, beta, path=len(path))
 
 
 def run_steps(
     job: RolloutJob, envs: Sequence[Environment], seeds: Iterable[int], act: Act | None = None
 ) -> Iterator[Transition]:
-    """Run a job's episodes in these environments and yield every step. act: replaces the job's driver."""
+    """Run a job's episodes in these environments and yield every step. act: replaces the job's
+    driver.
+    """
     policies = tuple(_load(job, checkpoint) for checkpoint in job.driver.policies)
     setting = Setting(envs[0].actions, job.env.horizon, policies)
     rules = Rules(job.env.horizon, job.hold, job.patience, takeover=job.label == "takeover")
@@ -126,7 +144,9 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
     if job.policy is None or wanted is None or job.cameras is None:
         return job.cameras or wanted
     if not set(wanted.names) <= set(job.cameras.names) or wanted.size != job.cameras.size:
-        raise MismatchError("choice or size of cameras", str(job.policy.path), wanted, "the recording", job.cameras)
+        raise MismatchError(
+            "choice or size of cameras", str(job.policy.path), wanted, "the recording", job.cameras
+        )
     return job.cameras
 
 
@@ -134,7 +154,9 @@ def _load(job: RolloutJob, checkpoint: Checkpoint) -> LearnedPolicy:
     from manip_il.learn.policy import LearnedPolicy
 
     driver = job.driver
-    trust, device = (driver.trust, driver.device) if isinstance(driver, PolicyDriver) else (False, "cpu")
+    trust, device = (
+        (driver.trust, driver.device) if isinstance(driver, PolicyDriver) else (False, "cpu")
+    )
     spec = env_spec(job.env, observed_cameras(job))
     checkpoint.check_fits(spec)
     return LearnedPolicy.load(checkpoint, device, spec.instruction, trust=trust)

@@ -1,9 +1,9 @@
 """When the expert is queried, and what it returns.
 
-A rule is written `kind` or `kind:bound`, as in `every`, `one`, `probability:0.1` or `safety:0.5`. `rollout` applies it
-in every step to the learner's actions; `labelled` applies `one` after the episode. Differences between actions are
-divided by each dimension's longest step, and the largest quotient is compared with the bound, so that a bound means the
-same for every robot.
+A rule is written `kind` or `kind:bound`, as in `every`, `one`, `probability:0.1` or `safety:0.5`.
+`rollout` applies it in every step to the learner's actions; `labelled` applies `one` after the
+episode. Differences between actions are divided by each dimension's longest step, and the largest
+quotient is compared with the bound, so that a bound means the same for every robot.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,8 +22,9 @@ from manip_il.worlds.contract import Environment, Expert
 LabelMode = Literal["per_state", "takeover", "branch", "last"]
 """What the expert returns when it is queried.
 
-`per_state`: its label. `takeover`: the expert drives to the end, with its own horizon. `branch`: the expert drives some
-steps in a copy of the simulator. `last`: only the label of the last state, which tells the phase reached.
+`per_state`: its label. `takeover`: the expert drives to the end, with its own horizon. `branch`:
+the expert drives some steps in a copy of the simulator. `last`: only the label of the last state,
+which tells the phase reached.
 """
 _MOST = 1e6  # largest bound
 _STREAM = "ask"  # random stream; another name would draw other states
@@ -48,13 +49,18 @@ class Query:
                 raise UsageError(f"query is {self}; expected {self.kind} alone")
         elif self.bound is None or not limits[0] <= self.bound <= limits[1]:
             low, high = limits
-            raise UsageError(f"query is {self}; expected {self.kind}:NUMBER, from {low:g} to {high:g}")
+            raise UsageError(
+                f"query is {self}; expected {self.kind}:NUMBER, from {low:g} to {high:g}"
+            )
 
     def __str__(self) -> str:
         return self.kind if self.bound is None else f"{self.kind}:{self.bound:g}"
 
     def start(self, setting: Setting) -> Gate:
-        """Return the rule for the episodes of one process. Raises `UsageError` if `setting` has too few policies."""
+        """Return the rule for the episodes of one process.
+
+        Raises `UsageError` if `setting` has too few policies.
+        """
         rule, _ = RULES[self.kind]
         return rule(self.bound or 0.0, setting)
 
@@ -65,11 +71,14 @@ def _every(bound: float, setting: Setting) -> Gate:
 
 
 def _one(bound: float, setting: Setting) -> Gate:
-    """Query once per episode, at a uniformly drawn step (with one episode per round: Stagger, Li & Zhang 2025).
+    """Query once per episode, at a uniformly drawn step (with one episode per round: Stagger, Li &
+    Zhang 2025).
 
     For a takeover the step is drawn from the horizon, so an episode that ends earlier has no query.
     """
-    return lambda turns, actions: [turn.step == drawn_step(turn.seed, setting.horizon) for turn in turns]
+    return lambda turns, actions: [
+        turn.step == drawn_step(turn.seed, setting.horizon) for turn in turns
+    ]
 
 
 def _probability(bound: float, setting: Setting) -> Gate:
@@ -79,16 +88,20 @@ def _probability(bound: float, setting: Setting) -> Gate:
 
 
 def _ensemble(bound: float, setting: Setting) -> Gate:
-    """Query if policies that differ by their seed disagree by more than the bound (Menda et al. 2019).
+    """Query if policies that differ by their seed disagree by more than the bound (Menda et al.
+    2019).
 
-    Disagreement is the root mean square distance of their actions from the mean, in the worst dimension.
+    Disagreement is the root mean square distance of their actions from the mean, in the worst
+    dimension.
     """
     if len(setting.policies) < 2:
         raise UsageError("query=ensemble needs at least two policies")
     others = setting.policies[1:]
 
     def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
-        answers = np.stack([np.stack(actions), *(policy_actions(policy, turns) for policy in others)])
+        answers = np.stack(
+            [np.stack(actions), *(policy_actions(policy, turns) for policy in others)]
+        )
         return ((answers.std(axis=0) / setting.actions.scale).max(axis=-1) > bound).tolist()
 
     return gate
@@ -97,18 +110,23 @@ def _ensemble(bound: float, setting: Setting) -> Gate:
 def _safety(bound: float, setting: Setting) -> Gate:
     """Query if expert and learner differ by more than the bound (Zhang & Cho 2017).
 
-    The expert labels every state for this comparison; the label is kept only if they differ that much.
+    The expert labels every state for this comparison; the label is kept only if they differ that
+    much.
     """
 
     def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
         labels = [turn.label or turn.peek() for turn in turns]
         pairs = zip(labels, actions, strict=True)
-        return [bool(np.abs((one.action - action) / setting.actions.scale).max() > bound) for one, action in pairs]
+        return [
+            bool(np.abs((one.action - action) / setting.actions.scale).max() > bound)
+            for one, action in pairs
+        ]
 
     return gate
 
 
-RULES: dict[str, tuple[Callable[[float, Setting], Gate], tuple[float, float] | None]] = {  # kind -> rule, bound limits
+# kind -> rule, bound limits
+RULES: dict[str, tuple[Callable[[float, Setting], Gate], tuple[float, float] | None]] = {
     "every": (_every, None),
     "one": (_one, None),
     "probability": (_probability, (1e-6, 1.0)),
@@ -118,7 +136,10 @@ RULES: dict[str, tuple[Callable[[float, Setting], Gate], tuple[float, float] | N
 
 
 def parse_query(text: str) -> Query:
-    """Parse a rule. Raises `UnknownName` for an unknown kind, `UsageError` for an invalid or missing bound."""
+    """Parse a rule.
+
+    Raises `UnknownName` for an unknown kind, `UsageError` for an invalid or missing bound.
+    """
     kind, colon, bound = text.partition(":")
     try:
         return Query(kind, float(bound) if colon else None)
@@ -129,7 +150,8 @@ def parse_query(text: str) -> Query:
 def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
     """Return the rule by which a rollout queries the expert.
 
-    For `one` without takeover this rule never queries: `labelled` labels the drawn step when the episode is over.
+    For `one` without takeover this rule never queries: `labelled` labels the drawn step when the
+    episode is over.
     """
     if label == "last":
         return lambda turns, actions: [turn.step == setting.horizon - 1 for turn in turns]
@@ -139,7 +161,10 @@ def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
 
 
 def labelled(frames: list[Transition], query: Query, expert: Expert) -> list[Transition]:
-    """Return an episode's frames. If the query is `one`, first have the expert label one random step."""
+    """Return an episode's frames.
+
+    If the query is `one`, first have the expert label one random step.
+    """
     if query.kind == "one":
         step = drawn_step(frames[0].seed, len(frames))
         frames[step] = replace(frames[step], label=expert.label(frames[step].state))
@@ -147,14 +172,18 @@ def labelled(frames: list[Transition], query: Query, expert: Expert) -> list[Tra
 
 
 def cut_at_takeover(frames: list[Transition]) -> tuple[list[Transition], int]:
-    """Return an episode's frames, the learner's last one also `done`, and the number of the learner's frames."""
+    """Return an episode's frames, the learner's last one also `done`, and the number of the
+    learner's frames.
+    """
     own = next((i for i, frame in enumerate(frames) if frame.actor != Actor.LEARNER), len(frames))
     if own > 0:
         frames = [*frames[: own - 1], replace(frames[own - 1], done=True), *frames[own:]]
     return frames, own
 
 
-def branch(env: Environment, expert: Expert, first: State, seed: int, steps: int) -> Iterator[Transition]:
+def branch(
+    env: Environment, expert: Expert, first: State, seed: int, steps: int
+) -> Iterator[Transition]:
     """Yield the expert's next steps from a state; the last one is `done`."""
     yield from rollout([env], [seed], expert_actions, Rules(steps), expert, first=first)
 

@@ -1,7 +1,8 @@
-"""Workers of a Ray cluster: the one at `RAY_ADDRESS` or running on this machine, else a new local one.
+"""Workers of a Ray cluster: the one at `RAY_ADDRESS` or running on this machine, else a new local
+one.
 
-Workers return episodes to this process, which stores them. Nodes need no shared disk: policies and files of a user's
-own task and mesh are sent to them, once per node.
+Workers return episodes to this process, which stores them. Nodes need no shared disk: policies and
+files of a user's own task and mesh are sent to them, once per node.
 """
 
 import logging
@@ -54,14 +55,18 @@ class RayPool:
             try:
                 ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
             except (ConnectionError, RuntimeError, ValueError) as error:
-                raise ManipError(f"no Ray cluster: {error}; check RAY_ADDRESS, or unset it for a local one") from error
+                raise ManipError(
+                    f"no Ray cluster: {error}; check RAY_ADDRESS, or unset it for a local one"
+                ) from error
 
     @property
     def count(self) -> int:
         """Number of tasks that can run at once; grows with the cluster."""
         return self._most or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
-    def submit(self, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None) -> Future[list[Episode]]:
+    def submit(
+        self, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None
+    ) -> Future[list[Episode]]:
         """Submit some seeds of a job to the cluster."""
         files = [self._upload(policy.path) for policy in job.driver.policies]
         task = self._upload(job.env.task) if isinstance(job.env.task, Path) else None
@@ -81,7 +86,9 @@ class RayPool:
         if self._ours and ray.is_initialized():
             ray.shutdown()
 
-    def _settle(self, future: Future[list[Episode]], answer: Future[bytes], journal: Journal | None) -> None:
+    def _settle(
+        self, future: Future[list[Episode]], answer: Future[bytes], journal: Journal | None
+    ) -> None:
         """Store returned episodes, and set the future's result or error."""
         self._running.pop(future, None)
         try:
@@ -99,8 +106,14 @@ class RayPool:
 
     def _upload(self, folder: Path) -> Any:
         if folder not in self._folders:
-            root, paths = (folder.parent, [folder]) if folder.is_file() else (folder, sorted(folder.rglob("*.*")))
-            self._folders[folder] = ray.put({path.relative_to(root).as_posix(): path.read_bytes() for path in paths})
+            root, paths = (
+                (folder.parent, [folder])
+                if folder.is_file()
+                else (folder, sorted(folder.rglob("*.*")))
+            )
+            self._folders[folder] = ray.put(
+                {path.relative_to(root).as_posix(): path.read_bytes() for path in paths}
+            )
         return self._folders[folder]
 
 
@@ -113,10 +126,16 @@ def run_there(
     mesh: Files | None,
     *policies: Files,
 ) -> bytes:
-    """Run seeds on a node; return packed episodes and journals. Raises `ManipError` unless the node runs `version`."""
+    """Run seeds on a node; return packed episodes and journals.
+
+    Raises `ManipError` unless the node runs `version`.
+    """
     if version != __version__:
         node = ray.util.get_node_ip_address()
-        raise ManipError(f"the Ray node {node} has manip_il {__version__}, not {version}; install {version} there")
+        raise ManipError(
+            f"the Ray node {node} has manip_il {__version__}, not {version}; install {version}"
+            " there"
+        )
     with tempfile.TemporaryDirectory(prefix="manip_il-") as folder:
         if task is not None:
             file = _unpack(task, Path(folder) / "task") / Path(job.env.task).name
@@ -126,15 +145,21 @@ def run_there(
             at = _unpack(mesh, Path(folder) / "mesh") / name
             job = replace(job, env=replace(job.env, object=Path(f"mesh:{at}")))
         if isinstance(job.driver, PolicyDriver):
-            here = (_unpack(files, Path(folder) / str(number)) for number, files in enumerate(policies))
+            here = (
+                _unpack(files, Path(folder) / str(number)) for number, files in enumerate(policies)
+            )
             moved = tuple(map(lambda one, path: replace(one, path=path), job.driver.policies, here))
             job = replace(job, driver=replace(job.driver, policies=moved))
-        found = [(one.without_pictures(), journal.encode(one) if journal else b"") for one in job.run(seeds)]
+        found = [
+            (one.without_pictures(), journal.encode(one) if journal else b"")
+            for one in job.run(seeds)
+        ]
         return zstandard.compress(pickle.dumps(found), _LEVEL)
 
 
-# The engine counts deaths, so Ray must not retry. The remote function has another name than `run_there`, so that Ray
-# pickles `run_there` by name. So each node runs the `run_there` of its own version, which compares the versions.
+# The engine counts deaths, so Ray must not retry. The remote function has another name than
+# `run_there`, so that Ray pickles `run_there` by name. So each node runs the `run_there` of its own
+# version, which compares the versions.
 _run_remote = ray.remote(num_cpus=1, max_retries=0)(run_there)
 
 

@@ -1,4 +1,5 @@
-"""Record episodes: run the seeds that have no journal yet, and write each journal as soon as its episode ends.
+"""Record episodes: run the seeds that have no journal yet, and write each journal as soon as its
+episode ends.
 
 Record a dataset: the expert's demonstrations, or a policy's rollouts with the expert's labels.
 """
@@ -41,12 +42,19 @@ def journal_of(journals: Path, job: RolloutJob) -> Journal:
 
 
 def collect(
-    engine: Engine, job: RolloutJob, seeds: Sequence[int], journals: Path, on_episode: OnEpisode | None = None
+    engine: Engine,
+    job: RolloutJob,
+    seeds: Sequence[int],
+    journals: Path,
+    on_episode: OnEpisode | None = None,
 ) -> Iterator[tuple[Journal, Episode]]:
-    """Run the seeds that have no journal in `journals` yet; each finished episode is written at once.
+    """Run the seeds that have no journal in `journals` yet.
 
-    Yields what `read_journal` returns for each seed, in seed order, as soon as all earlier seeds are done. on_episode:
-    called when an episode is on disk; an exception in it ends the run, and finished episodes stay on disk.
+    Each finished episode is written at once.
+
+    Yields what `read_journal` returns for each seed, in seed order, as soon as all earlier seeds
+    are done. on_episode: called when an episode is on disk; an exception in it ends the run, and
+    finished episodes stay on disk.
     """
     journal = journal_of(journals, job)
     waiting = deque(seeds)
@@ -72,7 +80,9 @@ def collect_successes(
     journals: Path,
     on_episode: OnEpisode | None = None,
 ) -> Iterator[tuple[Journal, Episode]]:
-    """Run seeds in order until `count` episodes have succeeded; yield all episodes as `collect` does.
+    """Run seeds in order until `count` episodes have succeeded.
+
+    Yield all episodes as `collect` does.
 
     The episodes depend on the seeds alone. Raises `ManipError` if too few succeed.
     """
@@ -95,7 +105,11 @@ def provenance(job: RolloutJob) -> dict[str, Any]:
 
     An episode's random draws follow from these and its seed, by `Condition.draw`.
     """
-    source: dict[str, Any] = {"driver": job.driver.name, "round": job.round, "beta": job.driver.beta}
+    source: dict[str, Any] = {
+        "driver": job.driver.name,
+        "round": job.round,
+        "beta": job.driver.beta,
+    }
     if job.conditions:
         source["vary"] = [condition.to_json() for condition in job.conditions]
     if job.cameras and job.cameras.look != Look():
@@ -124,10 +138,11 @@ def record(
     progress: Progress | None = None,
     **options: Any,
 ) -> Dataset:
-    """Record a dataset: the expert's successful demonstrations or, given a policy, all of its rollouts.
+    """Record a dataset: the expert's successful demonstrations or, given a policy, all of its
+    rollouts.
 
-    Each frame holds the executed action and the expert's label. Finished episodes are written at once, to the folder
-    `journals_of(root)`.
+    Each frame holds the executed action and the expert's label. Finished episodes are written at
+    once, to the folder `journals_of(root)`.
 
     Args:
         root: The dataset's folder.
@@ -141,7 +156,8 @@ def record(
         video: How pictures are encoded.
         resume: Whether to continue the recording in the folders.
         progress: Follows the recording.
-        options: Fields of `RolloutJob`, such as `label` and `cameras`; `round` is by default 1 with a policy, else 0.
+        options: Fields of `RolloutJob`, such as `label` and `cameras`; `round` is by default 1 with
+            a policy, else 0.
 
     Returns:
         The dataset.
@@ -154,8 +170,14 @@ def record(
     journals = journals_of(root)
     progress = progress or Progress()
     video = video or VideoConfig()
-    driver = RolloutJob.driver if policy is None else PolicyDriver.of(policy_folder(policy), beta=beta)
-    chosen: dict[str, Any] = {"hold": HOLD, "round": 0 if policy is None else 1, "query": parse_query(query)}
+    driver = (
+        RolloutJob.driver if policy is None else PolicyDriver.of(policy_folder(policy), beta=beta)
+    )
+    chosen: dict[str, Any] = {
+        "hold": HOLD,
+        "round": 0 if policy is None else 1,
+        "query": parse_query(query),
+    }
     job = make_options(RolloutJob, env=env_of_name(env), driver=driver, **chosen | options)
     episodes = checks.whole("episodes", episodes, 1, BLOCK // MAX_TRIES)
     env_spec(job.env, job.cameras)  # raises if no scene can be made, before anything is written
@@ -170,13 +192,17 @@ def record(
     for line in journal_of(journals, job).prepare():
         _LOG.warning(line)
     recording = Recording(
-        provenance=provenance(job), video=asdict(video) if job.cameras else {}, only_labelled=not job.labels_all
+        provenance=provenance(job),
+        video=asdict(video) if job.cameras else {},
+        only_labelled=not job.labels_all,
     )
     if policy is None:
         recording = replace(recording, only_successes=True, episodes=episodes)
     before, now = (one.provenance.get("vary") for one in (Recording.read(journals), recording))
     if done and before != now:
-        raise MismatchError("what --vary draws from", str(journals), before, "the command line", now)
+        raise MismatchError(
+            "what --vary draws from", str(journals), before, "the command line", now
+        )
     progress.start(f"record {job.env.robot} {job.env.task}", max(0, episodes - done))
     with engine_of(workers) as engine:
         if policy is None:

@@ -1,7 +1,8 @@
 """The only loop that steps environments, as a generator of transitions.
 
-Environments run in lockstep, so that a learner acts in all of them in one batch. Recording, labelling and evaluation
-consume its transitions and are not branches inside it. In this loop only `_choose` queries the expert.
+Environments run in lockstep, so that a learner acts in all of them in one batch. Recording,
+labelling and evaluation consume its transitions and are not branches inside it. In this loop only
+`_choose` queries the expert.
 """
 
 import math
@@ -17,7 +18,8 @@ GROWTH = 0.01  # smallest increase of a task's progress, in [0, 1], that counts
 
 @dataclass(slots=True)
 class Turn:
-    """One running episode at one step, as a driver sees it. label: None if the expert was not queried.
+    """One running episode at one step, as a driver sees it. label: None if the expert was not
+    queried.
 
     environment: it is in this state until the turn ends.
     """
@@ -32,7 +34,10 @@ class Turn:
     environment: Environment | None = None
 
     def query(self) -> Label:
-        """Return the expert's label of this state and keep it. Raises `ManipError` if there is no expert."""
+        """Return the expert's label of this state and keep it.
+
+        Raises `ManipError` if there is no expert.
+        """
         if self.label is None:
             self.label = self.peek()
         return self.label
@@ -40,15 +45,17 @@ class Turn:
     def peek(self) -> Label:
         """Return the expert's label of this state without keeping it."""
         if self.expert is None:
-            raise ManipError(f"episode {self.seed}: there is no expert to query at step {self.step}")
+            raise ManipError(
+                f"episode {self.seed}: there is no expert to query at step {self.step}"
+            )
         return self.expert.label(self.state, self.environment)
 
 
 Act = Callable[[Sequence[Turn]], list[tuple[F64, Actor]]]
 """A started driver: returns an action (n,) and its actor for every turn of a step."""
 Gate = Callable[[Sequence[Turn], Sequence[F64]], Sequence[bool]]
-"""A started query rule: returns whether the expert is queried in each turn, given the actions (n,) that would be
-executed.
+"""A started query rule: returns whether the expert is queried in each turn, given the actions (n,)
+that would be executed.
 """
 
 
@@ -56,9 +63,10 @@ executed.
 class Rules:
     """When an episode ends.
 
-    horizon: most control steps. hold: continue for this many steps after success, then end; None: to the horizon.
-    patience: also end after this many steps without progress. takeover: once queried, the expert drives to the end, for
-    at most `horizon` steps more than the learner alone has.
+    horizon: most control steps. hold: continue for this many steps after success, then end; None:
+    to the horizon. patience: also end after this many steps without progress. takeover: once
+    queried, the expert drives to the end, for at most `horizon` steps more than the learner alone
+    has.
     """
 
     horizon: int
@@ -98,8 +106,9 @@ def rollout(
 ) -> Iterator[Transition]:
     """Run one episode per seed, `len(envs)` at a time; yield the transition of every step.
 
-    An environment whose episode ends takes the next seed. An episode depends on its seed alone, not on other episodes.
-    gate: when to query the expert; None: only if `act` does. first: start state of every episode; None: drawn by seed.
+    An environment whose episode ends takes the next seed. An episode depends on its seed alone, not
+    on other episodes. gate: when to query the expert; None: only if `act` does. first: start state
+    of every episode; None: drawn by seed.
     """
     waiting = iter(seeds)
     running = [slot for env in envs if (slot := _next_episode(env, waiting, first)) is not None]
@@ -131,7 +140,9 @@ def _next_episode(env: Environment, seeds: Iterator[int], first: State | None) -
 def _observe(slot: _Slot, expert: Expert) -> None:
     env = slot.env
     seen, state = env.observe(), env.get_state()
-    slot.turn = Turn(slot.seed, slot.step, seen, state, expert, progress=env.progress, environment=env)
+    slot.turn = Turn(
+        slot.seed, slot.step, seen, state, expert, progress=env.progress, environment=env
+    )
 
 
 def _choose(running: Sequence[_Slot], act: Act, gate: Gate | None, takeover: bool) -> None:
@@ -160,7 +171,9 @@ def _advance(slot: _Slot, rules: Rules) -> Transition:
         slot.since_solved += 1
     horizon = 2 * rules.horizon if slot.taken_over else rules.horizon
     has_ended = rules.hold is not None and slot.since_solved > rules.hold
-    gives_up = rules.patience is not None and not slot.since_solved and slot.is_stuck(rules.patience)
+    gives_up = (
+        rules.patience is not None and not slot.since_solved and slot.is_stuck(rules.patience)
+    )
     return Transition(
         seed=slot.seed,
         step=slot.step - 1,

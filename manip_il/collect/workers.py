@@ -1,10 +1,11 @@
 """Run rollout jobs in this process, in local processes, or on a Ray cluster.
 
-Each seed of a job always gives the same episode. So if a worker dies, its unfinished seeds simply run again, each
-alone, which identifies the seed that kills workers.
+Each seed of a job always gives the same episode. So if a worker dies, its unfinished seeds simply
+run again, each alone, which identifies the seed that kills workers.
 
-Processes are forked from a server that has only imported what they need. So they inherit neither OpenGL nor
-threads, and the slow import of torch runs once. They end with the process that started them, even if that is killed.
+Processes are forked from a server that has only imported what they need. So they inherit neither
+OpenGL nor threads, and the slow import of torch runs once. They end with the process that started
+them, even if that is killed.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ _CONTEXT = multiprocessing.get_context("forkserver")
 class Engine:
     """Runs rollout jobs; use as a context manager. Workers live as long as the engine.
 
-    workers: processes, 1 for this process alone; on Ray the number of concurrent tasks; None for one per core.
+    workers: processes, 1 for this process alone; on Ray the number of concurrent tasks; None for
+    one per core.
     """
 
     def __init__(self, workers: int | None = 1, backend: Backend = "local"):
@@ -50,13 +52,17 @@ class Engine:
         self._backend: Backend = backend
         self._pool: Pool | None = None
 
-    def run(self, job: RolloutJob, seeds: Sequence[int], journal: Journal | None = None) -> Iterator[Episode]:
+    def run(
+        self, job: RolloutJob, seeds: Sequence[int], journal: Journal | None = None
+    ) -> Iterator[Episode]:
         """Yield one episode per seed, in no fixed order, when it has ended and is in the journal.
 
-        Episodes from other processes come without pictures. Raises what the job raises, and `ManipError` if a seed
-        that ran alone kills its worker.
+        Episodes from other processes come without pictures. Raises what the job raises, and
+        `ManipError` if a seed that ran alone kills its worker.
         """
-        if self._backend == "local" and (self.workers == 1 or (len(seeds) == 1 and self._pool is None)):
+        if self._backend == "local" and (
+            self.workers == 1 or (len(seeds) == 1 and self._pool is None)
+        ):
             yield from run_seeds(job, seeds, journal)
             return
         self._pool = self._pool or self._open()
@@ -68,7 +74,9 @@ class Engine:
             raise
 
     def warm_up(self, learned: bool) -> None:
-        """Start the workers' server in the background. learned: whether the workers will run policies."""
+        """Start the workers' server in the background. learned: whether the workers will run
+        policies.
+        """
         if self._backend == "local" and self.workers != 1:
             start_server(learned)
 
@@ -115,7 +123,8 @@ class Engine:
                     yield pool.submit(job, (seed,), journal).result()
                 except BrokenExecutor:
                     raise ManipError(
-                        f"seed {seed} killed its worker twice (out of memory?); finished episodes are kept"
+                        f"seed {seed} killed its worker twice (out of memory?); finished episodes"
+                        " are kept"
                     ) from None
 
 
@@ -131,7 +140,9 @@ class LocalPool:
         self.count = count
         self._pool: ProcessPoolExecutor | None = None
 
-    def submit(self, job: RolloutJob, seeds: Seeds, journal: Journal | None) -> Future[list[Episode]]:
+    def submit(
+        self, job: RolloutJob, seeds: Seeds, journal: Journal | None
+    ) -> Future[list[Episode]]:
         """Submit some seeds of a job."""
         self._pool = self._pool or open_pool(self.count, learned=job.policy is not None)
         try:
@@ -147,22 +158,28 @@ class LocalPool:
             self._pool = None
 
 
-def map_in_order[T, R](function: Callable[[T], R], items: Iterable[T], workers: int) -> Generator[tuple[T, R]]:
+def map_in_order[T, R](
+    function: Callable[[T], R], items: Iterable[T], workers: int
+) -> Generator[tuple[T, R]]:
     """Yield each item with its result, in order; at most `workers` + 1 of them are in memory.
 
-    With one worker this process does the work, else items and results are pickled. Raises `ManipError` if a worker
-    dies.
+    With one worker this process does the work, else items and results are pickled. Raises
+    `ManipError` if a worker dies.
     """
     if workers == 1:
         yield from ((item, function(item)) for item in items)
         return
     pool, items = open_pool(workers), iter(items)
     try:
-        waiting = deque((item, pool.submit(_in_worker, function, item)) for item in islice(items, workers + 1))
+        waiting = deque(
+            (item, pool.submit(_in_worker, function, item)) for item in islice(items, workers + 1)
+        )
         while waiting:
             item, result = waiting.popleft()
             yield item, result.result()
-            waiting.extend((item, pool.submit(_in_worker, function, item)) for item in islice(items, 1))
+            waiting.extend(
+                (item, pool.submit(_in_worker, function, item)) for item in islice(items, 1)
+            )
     except BrokenExecutor as error:
         raise ManipError("a worker died (out of memory?); try fewer --workers") from error
     finally:
@@ -178,7 +195,8 @@ def open_pool(workers: int, *, learned: bool = False) -> ProcessPoolExecutor:
 
 def kill_pool(pool: ProcessPoolExecutor) -> None:
     """Kill a pool's processes."""
-    for process in list((pool._processes or {}).values()):  # pyright: ignore[reportPrivateUsage]  # public from 3.14 on
+    running = pool._processes or {}  # pyright: ignore[reportPrivateUsage]  # public from 3.14 on
+    for process in list(running.values()):
         process.kill()
     pool.shutdown(cancel_futures=True)
 
@@ -186,12 +204,16 @@ def kill_pool(pool: ProcessPoolExecutor) -> None:
 def start_server(learned: bool) -> None:
     """Start, once per process, the background server that workers are forked from.
 
-    learned: also import policies. The server keeps the current environment variables, but uses one OpenMP thread.
+    learned: also import policies. The server keeps the current environment variables, but uses one
+    OpenMP thread.
     """
-    _CONTEXT.set_forkserver_preload(["manip_il.collect.job", *(["manip_il.learn.policy"] if learned else [])])
+    _CONTEXT.set_forkserver_preload(
+        ["manip_il.collect.job", *(["manip_il.learn.policy"] if learned else [])]
+    )
     threads = os.environ.get("OMP_NUM_THREADS")
     resource_tracker.ensure_running()  # first, because starting it would undo the mask
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # only this process handles Ctrl-C
+    # only this process handles Ctrl-C
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported; one core each
     try:
         forkserver.ensure_running()
@@ -228,7 +250,10 @@ def run_task(job: RolloutJob, seeds: Seeds, journal: Journal | None) -> list[Epi
 
 
 def _in_worker[**P, R](function: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
-    """Call a function in a worker. Raises `ManipError` for any exception: it may not be picklable."""
+    """Call a function in a worker.
+
+    Raises `ManipError` for any exception: it may not be picklable.
+    """
     try:
         return function(*arguments, **options)
     except ManipError:
@@ -238,7 +263,9 @@ def _in_worker[**P, R](function: Callable[P, R], *arguments: P.args, **options: 
 
 
 def split(job: RolloutJob, seeds: Sequence[int], workers: int) -> deque[Seeds]:
-    """Split seeds into tasks: of one seed or, if a learner drives, of a batch small enough to keep all workers busy."""
+    """Split seeds into tasks: of one seed or, if a learner drives, of a batch small enough to
+    keep all workers busy.
+    """
     size = 1 if job.policy is None else max(1, min(job.batch, -(-len(seeds) // workers)))
     return deque(tuple(seeds[i : i + size]) for i in range(0, len(seeds), size))
 

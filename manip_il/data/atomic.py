@@ -26,7 +26,8 @@ from manip_il.errors import FolderExistsError, ManipError, UsageError
 
 PARTIAL = ".partial"  # suffix of unfinished files and folders
 UNFINISHED_MARK = ".manip_il_unfinished"  # file in the folder around one that is being written
-CONFIG_FILE, CONFIG_HEADER = "config.yaml", "# manip-il"  # options of a command, and how their first line begins
+# options of a command, and how their first line begins
+CONFIG_FILE, CONFIG_HEADER = "config.yaml", "# manip-il"
 DATASET = "a dataset"
 EPISODES = "journals"
 POLICY = "a policy"
@@ -37,7 +38,9 @@ _OPTIONS = re.compile(rf"{CONFIG_HEADER} .*\((\w+)\)\n".encode())
 
 
 def output_of(options: str) -> str:
-    """Return the kind of the folder that holds a command's options. options: name of their class."""
+    """Return the kind of the folder that holds a command's options. options: name of their
+    class.
+    """
     command = options.removesuffix("Options").lower()
     return EPISODES if command == "record" else f"the output of manip-il {command}"
 
@@ -48,15 +51,19 @@ _MARKS = (  # kind, file and a text in it that only we write
     (DATASET, "meta/info.json", b'"executed_action"'),  # imported from the MCAP files of a dataset
     (EPISODES, "recording.json", b'"only_successes"'),
     (POLICY, "manip_il.json", b'"action_meaning"'),
-    (CHECKPOINT, "pretrained_model/config.json", b'"type"'),  # perhaps a copy of somebody's policy, in a run of ours
-    (output_of("Dagger"), "settings.json", b'"label_budget"'),  # a run from Python, as in the next two
+    # perhaps a copy of somebody's policy, in a run of ours
+    (CHECKPOINT, "pretrained_model/config.json", b'"type"'),
+    # a run from Python, as in the next two
+    (output_of("Dagger"), "settings.json", b'"label_budget"'),
     (output_of("Train"), "metrics.jsonl", b'"samples_per_s"'),
     (output_of("Eval"), "eval.json", b'"fingerprint"'),
 )
 
 
 def kind_of(folder: Path) -> str | None:
-    """Return the kind of a folder that this program made; "" if there is none yet, None if somebody else made it.
+    """Return the kind of a folder that this program made.
+
+    "" if there is none yet, None if somebody else made it.
 
     A folder that holds at most unfinished files counts as none.
     """
@@ -75,7 +82,9 @@ def kind_of(folder: Path) -> str | None:
 
 def is_our_file(path: Path) -> bool:
     """Return whether a file names this program, as each single file that a command writes does."""
-    return path.is_file() and re.search(rb"manip[-_]il", checks.read_bytes(path, "a file")) is not None
+    return (
+        path.is_file() and re.search(rb"manip[-_]il", checks.read_bytes(path, "a file")) is not None
+    )
 
 
 def require_ours(folder: Path, kind: str) -> None:
@@ -83,11 +92,14 @@ def require_ours(folder: Path, kind: str) -> None:
     there = kind_of(folder)
     if there not in ("", kind):
         found = there or "files that manip-il did not make"
-        raise UsageError(f"{folder} holds {found}; expected {kind} or an empty folder: choose another folder")
+        raise UsageError(
+            f"{folder} holds {found}; expected {kind} or an empty folder: choose another folder"
+        )
 
 
 def require_replaceable(folder: Path, kind: str = "") -> None:
-    """Raise `UsageError` unless there is nothing at `folder`, or a folder of this kind and no link to one.
+    """Raise `UsageError` unless there is nothing at `folder`, or a folder of this kind and no link
+    to one.
 
     Without a kind, raises `FolderExistsError` for anything that is there.
     """
@@ -96,7 +108,9 @@ def require_replaceable(folder: Path, kind: str = "") -> None:
     if not kind:
         raise FolderExistsError(folder)
     if folder.is_symlink():
-        raise UsageError(f"{folder} is a link, which is not followed to replace files; give {folder.resolve()}")
+        raise UsageError(
+            f"{folder} is a link, which is not followed to replace files; give {folder.resolve()}"
+        )
     require_ours(folder, kind)
 
 
@@ -105,7 +119,10 @@ _WRITE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # never 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Generator[None]:
-    """Raise `ManipError` if the disk is full or read-only. It names the file that failed, or `path` if unknown."""
+    """Raise `ManipError` if the disk is full or read-only.
+
+    It names the file that failed, or `path` if unknown.
+    """
     try:
         yield
     except Exception as error:
@@ -120,10 +137,13 @@ def writing(path: Path) -> Generator[None]:
 
 @contextlib.contextmanager
 def new_folder(root: Path, *, replaces: str = "") -> Generator[Path]:
-    """Yield an empty folder beside `root` to write into; at the end, sync it to disk and rename it to `root`.
+    """Yield an empty folder beside `root` to write into.
 
-    It is in `.NAME.partial`, which an exception removes, and which the next writer empties if a killed process left it.
-    Raises `ManipError` if the disk is full or read-only, or if another process writes the same folder.
+    At the end, sync it to disk and rename it to `root`.
+
+    It is in `.NAME.partial`, which an exception removes, and which the next writer empties if a
+    killed process left it. Raises `ManipError` if the disk is full or read-only, or if another
+    process writes the same folder.
 
     Args:
         root: The new folder. It must not exist or be empty, at the beginning and at the end.
@@ -160,7 +180,8 @@ def new_folder(root: Path, *, replaces: str = "") -> Generator[Path]:
 def exclusive(folder: Path) -> Generator[int]:
     """Lock `folder` for this process, creating it if it does not exist; yield its file descriptor.
 
-    The kernel releases the locks of a killed process. Raises `ManipError` if another process holds the lock.
+    The kernel releases the locks of a killed process. Raises `ManipError` if another process holds
+    the lock.
     """
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -169,7 +190,10 @@ def exclusive(folder: Path) -> Generator[int]:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            text = f"{folder} is in use by another process; wait until that is done, or choose another folder"
+            text = (
+                f"{folder} is in use by another process; wait until that is done, or choose another"
+                " folder"
+            )
             raise ManipError(text) from error
         except OSError:  # a cluster's file system may not support locks
             pass
@@ -183,7 +207,9 @@ def exclusive(folder: Path) -> Generator[int]:
 
 
 def clear(folder: Path, keep: Path | None = None) -> None:
-    """Delete everything in a folder except `keep`, but not the folder itself, which may be locked or a mount point."""
+    """Delete everything in a folder except `keep`, but not the folder itself, which may be
+    locked or a mount point.
+    """
     for path in folder.iterdir():
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -193,7 +219,9 @@ def clear(folder: Path, keep: Path | None = None) -> None:
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write `content` to `path` as JSON, atomically as `write_file` does."""
-    write_file(path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode())
+    write_file(
+        path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode()
+    )
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -238,16 +266,23 @@ Record = Mapping[str, Any]
 def read_lines(path: Path) -> list[dict[str, Any]]:
     """Return every record, except a truncated last line; [] if there is no file.
 
-    Non-finite numbers are None. Raises `ManipError` naming any other line that is not a JSON object.
+    Non-finite numbers are None. Raises `ManipError` naming any other line that is not a JSON
+    object.
     """
     lines = checks.read_bytes(path, "JSON lines").splitlines(keepends=True) if path.exists() else []
     whole = [line for line in lines if line.endswith(b"\n")]
     names = (f"{path}, line {number}" for number in itertools.count(1))
-    return [checks.mapping(name, checks.parse_json(name, line)) for name, line in zip(names, whole, strict=False)]
+    return [
+        checks.mapping(name, checks.parse_json(name, line))
+        for name, line in zip(names, whole, strict=False)
+    ]
 
 
 def append_line(path: Path, record: Record) -> None:
-    """Append a record, replacing a truncated last line; non-finite numbers at its top level become null."""
+    """Append a record, replacing a truncated last line.
+
+    Non-finite numbers at its top level become null.
+    """
     line = json.dumps(_finite(record), allow_nan=False, default=_plain).encode() + b"\n"
     path.parent.mkdir(parents=True, exist_ok=True)
     with writing(path), open(path, "ab+", opener=checks.without_link) as file:
@@ -258,7 +293,10 @@ def append_line(path: Path, record: Record) -> None:
 
 
 def _finite(record: Record) -> dict[str, Any]:
-    return {key: None if isinstance(one, float) and not math.isfinite(one) else one for key, one in record.items()}
+    return {
+        key: None if isinstance(one, float) and not math.isfinite(one) else one
+        for key, one in record.items()
+    }
 
 
 def _plain(value: Any) -> Any:

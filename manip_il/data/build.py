@@ -31,18 +31,23 @@ from manip_il.mdp import KEYPOINTS, Episode
 _LOG = logging.getLogger(__name__)
 RECORDING = "recording.json"
 # settings of an encoder, which may differ between films of a camera
-_ENCODER = [f"video.{one}" for one in ("g", "crf", "preset", "fast_decode", "video_backend", "extra_options")]
+_ENCODER = [
+    f"video.{one}"
+    for one in ("g", "crf", "preset", "fast_decode", "video_backend", "extra_options")
+]
 Rollouts = Iterable[tuple[Journal, Episode]]
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Settings for making a dataset from rollouts, stored as `recording.json` in the folder of their journals.
+    """Settings for making a dataset from rollouts, stored as `recording.json` in the folder of
+    their journals.
 
-    A rollout becomes one episode per part (see `parts`). only_successes: leave out failed episodes. only_labelled:
-    leave out episodes without a valid label. episodes: number of episodes to keep, in seed order; None: all. labels:
-    number of valid labels to keep; later ones have `label_valid` 0, and later episodes are left out. provenance: who
-    drove, stored in the dataset. video: fields of `VideoConfig`.
+    A rollout becomes one episode per part (see `parts`). only_successes: leave out failed episodes.
+    only_labelled: leave out episodes without a valid label. episodes: number of episodes to keep,
+    in seed order; None: all. labels: number of valid labels to keep; later ones have `label_valid`
+    0, and later episodes are left out. provenance: who drove, stored in the dataset. video: fields
+    of `VideoConfig`.
     """
 
     only_successes: bool = False
@@ -58,7 +63,10 @@ class Recording:
 
     @classmethod
     def read(cls, journals: Path) -> Recording:
-        """Return the settings in `recording.json`; if it is missing, settings that keep every episode."""
+        """Return the settings in `recording.json`.
+
+        If it is missing, settings that keep every episode.
+        """
         path = journals / RECORDING
         if not path.is_file():
             return cls()
@@ -70,8 +78,9 @@ class Recording:
     def make(self, rollouts: Rollouts, root: Path, *, replace: bool = False) -> tuple[Info, int]:
         """Write rollouts as a dataset; return its info and the number of failed episodes left out.
 
-        Spec and fingerprint are the first rollout's; if another fingerprint differs, a warning is logged. The selection
-        depends on the rollouts alone, so that recording directly and building later give the same bytes.
+        Spec and fingerprint are the first rollout's; if another fingerprint differs, a warning is
+        logged. The selection depends on the rollouts alone, so that recording directly and building
+        later give the same bytes.
 
         Args:
             rollouts: In seed order; all are consumed, even after a limit is reached.
@@ -115,7 +124,8 @@ class Recording:
                         labels -= own
             if empty:
                 raise NothingToLearnError(
-                    "no episode has labels to learn from: the expert was never queried or gave no valid label"
+                    "no episode has labels to learn from: the expert was never queried or gave no"
+                    " valid label"
                 )
             provenance.update(seeds=[seeds[0], seeds[-1]], tried=len(seeds))
 
@@ -129,7 +139,9 @@ class Recording:
 
 
 def _compare(journal: Journal, name: str, about: Journal) -> None:
-    """Raise `MismatchError` for another spec than the first journal's, and warn of another fingerprint."""
+    """Raise `MismatchError` for another spec than the first journal's, and warn of another
+    fingerprint.
+    """
     first = "the first journal"
     if journal.spec != about.spec:
         raise MismatchError("spec (robot, task or cameras)", name, journal.spec, first, about.spec)
@@ -145,10 +157,12 @@ def _first_labels(episode: Episode, most: float) -> Episode:
 
 
 def build(journals: Path, root: Path, *, replace: bool = False) -> tuple[Info, int]:
-    """Build a LeRobot dataset from a folder of journals, in seed order, equal to the dataset that `record` writes.
+    """Build a LeRobot dataset from a folder of journals, in seed order, equal to the dataset that
+    `record` writes.
 
-    Returns and raises what `Recording.make` does. Also raises `ManipError` if journals are missing or damaged.
-    replace: replace an existing `root`; otherwise raises `FolderExistsError` if `root` is not empty.
+    Returns and raises what `Recording.make` does. Also raises `ManipError` if journals are missing
+    or damaged. replace: replace an existing `root`; otherwise raises `FolderExistsError` if `root`
+    is not empty.
     """
     recording = Recording.read(journals)
     if not (paths := list_episodes(journals)):
@@ -165,18 +179,21 @@ def merge_datasets(
     provenance: Mapping[str, Any] | None = None,
     replace: bool = False,
 ) -> Info:
-    """Merge datasets, ours or others', in order, into one; equal to `write_dataset` of all their episodes if ours.
+    """Merge datasets, ours or others', in order, into one.
 
-    Every column, every frame's text and the video files are copied. Datasets of ours are described as such: the
-    fingerprint is the first one's, and if another differs, a warning is logged; the names and provenance of the sources
-    are added to `provenance`.
+    Equal to `write_dataset` of all their episodes if ours.
+
+    Every column, every frame's text and the video files are copied. Datasets of ours are described
+    as such: the fingerprint is the first one's, and if another differs, a warning is logged; the
+    names and provenance of the sources are added to `provenance`.
 
     Args:
         roots: The datasets.
         root: The new one.
         provenance: Its origin, if a dataset is ours.
         replace: As in `new_folder`.
-        episodes: Episodes to keep, as in `choose_episodes`, numbered as in the merged datasets; by default all.
+        episodes: Episodes to keep, as in `choose_episodes`, numbered as in the merged datasets; by
+            default all.
         renamed: Camera -> its new name, both with `observation.images.`.
 
     Raises:
@@ -195,7 +212,8 @@ def merge_datasets(
         if len(table) < len(one.stored_features):
             raise UsageError(f"--rename_map gives two columns of {one.root} the same name")
         for key, feature in table.items():
-            if features.setdefault(key, feature)["dtype"] == "image":  # encoded if others have films
+            # encoded if others have films
+            if features.setdefault(key, feature)["dtype"] == "image":
                 features[key] = feature
 
     def chosen() -> Iterator[EpisodeData]:
@@ -208,11 +226,16 @@ def merge_datasets(
             before += dataset.info.episodes
 
     about = opened[0].fps, opened[0].info.robot, own
-    return write_episodes(chosen(), root, features, *about, tables=opened[0].other_tables, replace=replace)
+    return write_episodes(
+        chosen(), root, features, *about, tables=opened[0].other_tables, replace=replace
+    )
 
 
 def choose_episodes(words: Sequence[str], count: int) -> set[int]:
-    """Return the numbers of the chosen episodes among `count`. words: `7`, `0:50` (0 to 49), `50:`; none: all."""
+    """Return the numbers of the chosen episodes among `count`. words: `7`, `0:50` (0 to 49), `50:`.
+
+    none: all.
+    """
     chosen: set[int] = set()
     for word in words or [":"]:
         first, colon, stop = word.partition(":")
@@ -221,7 +244,10 @@ def choose_episodes(words: Sequence[str], count: int) -> set[int]:
         except ValueError:
             numbers = range(0)
         if not 0 <= numbers.start < numbers.stop <= count:
-            raise UsageError(f"--dataset.episodes has {checks.shorten(word)}; expected numbers and ranges in 0:{count}")
+            raise UsageError(
+                f"--dataset.episodes has {checks.shorten(word)}; expected numbers and ranges in"
+                f" 0:{count}"
+            )
         chosen.update(numbers)
     return chosen
 
@@ -229,18 +255,25 @@ def choose_episodes(words: Sequence[str], count: int) -> set[int]:
 def _merged_description(
     opened: Sequence[Dataset], names: Mapping[str, str], provenance: Mapping[str, Any]
 ) -> Own | None:
-    """Return the content of `meta/manip_il.json` for merged datasets; None if no dataset is ours."""
+    """Return the content of `meta/manip_il.json` for merged datasets.
+
+    None if no dataset is ours.
+    """
     if (about := next((one for one in opened if one.own), None)) is None:
         return None
     own = opened[0].fingerprint
     for one in opened:
         also = ("sim_state_size", "image_size", *(("task",) if one.own else ()))
         check_same_spec(str(about.root), about.spec, str(one.root), one.spec, also)
-        for warning in compare_fingerprints(str(opened[0].root), own, str(one.root), one.fingerprint):
+        for warning in compare_fingerprints(
+            str(opened[0].root), own, str(one.root), one.fingerprint
+        ):
             _LOG.warning("%s", warning)
     sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
     cameras = tuple(names.get(key, key).removeprefix(IMAGES) for key in about.spec.image_keys)
-    spec = dataclasses.replace(about.spec, cameras=cameras, video=any(one.spec.video for one in opened))
+    spec = dataclasses.replace(
+        about.spec, cameras=cameras, video=any(one.spec.video for one in opened)
+    )
     return Own(spec, own, {**provenance, "merged": sources})
 
 
@@ -269,12 +302,18 @@ def _check_same_facts(left: Dataset, right: Dataset, names: Mapping[str, str]) -
 
 
 def _facts(dataset: Dataset, names: Mapping[str, str]) -> dict[str, str]:
-    """Return what merged datasets must have in common: rate, robot, columns, films, other tables."""
+    """Return what merged datasets must have in common: rate, robot, columns, films, other
+    tables.
+    """
     facts = {"fps": str(dataset.fps), "robot_type": dataset.info.robot or "none"}
     for key, one in dataset.features.items():
         name, kind = names.get(key, key), "pictures" if one.dtype in PICTURES else one.dtype
         facts[f"column {name}"] = f"{kind} of shape {[*one.shape]}, named {one.names}"
-        facts |= {f"film {name}: {what}": str(value) for what, value in one.details.items() if what not in _ENCODER}
+        facts |= {
+            f"film {name}: {what}": str(value)
+            for what, value in one.details.items()
+            if what not in _ENCODER
+        }
     for key in {key for row in dataset.episodes.others for key in row} - {layout.DRAWN}:
         facts[f"column {key} of meta/episodes"] = "a column"
     for path in dataset.other_tables:

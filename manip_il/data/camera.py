@@ -1,8 +1,8 @@
 """The pictures of one camera of a LeRobot v3.0 dataset, in video or data files, decoded on reading.
 
-All pictures of datasets are opened here, and only as MP4, PNG or JPEG. By default FFmpeg detects the format from the
-content: a playlist named `.mp4` would make it open other files and URLs. Pillow passes some formats to other programs
-(EPS to Ghostscript).
+All pictures of datasets are opened here, and only as MP4, PNG or JPEG. By default FFmpeg detects
+the format from the content: a playlist named `.mp4` would make it open other files and URLs. Pillow
+passes some formats to other programs (EPS to Ghostscript).
 """
 
 import itertools
@@ -34,7 +34,9 @@ Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 
 FORMATS = ("PNG", "JPEG")  # of pictures that are decoded
 _PIECE_BYTES = 32 * 1024 * 1024  # size of the pictures that a thread decodes at once
-_PIECE = 32  # least number of pictures decoded at once, because each piece is decoded from the key frame before it
+# least number of pictures decoded at once, because each piece is decoded from the key frame before
+# it
+_PIECE = 32
 _OPTIONS = {
     "protocol_whitelist": "file",
     "enable_drefs": "0",  # no tracks in other files
@@ -44,7 +46,9 @@ _OPEN_FILMS, _OPEN_TABLES = 32, 4  # video and data files that one process keeps
 
 @dataclass(frozen=True)
 class FrameRange:
-    """Frames `first` to `first + count - 1` of a file: the dataset's rows `row` to `row + count - 1`."""
+    """Frames `first` to `first + count - 1` of a file: the dataset's rows `row` to `row + count
+    - 1`.
+    """
 
     path: Path
     first: int
@@ -56,8 +60,9 @@ class FrameRange:
 class Camera:
     """Pictures of one camera.
 
-    key: its column. fps: [Hz]. size: height and width [pixels]. films: whether pictures are in video files; otherwise
-    they are cells of the data files. parts: ranges that hold every row once, in order.
+    key: its column. fps: [Hz]. size: height and width [pixels]. films: whether pictures are in
+    video files; otherwise they are cells of the data files. parts: ranges that hold every row once,
+    in order.
     """
 
     key: str
@@ -80,7 +85,10 @@ class Camera:
         starts = np.array([part.row for part in self.parts])
         which = np.searchsorted(starts, wanted, side="right") - 1
         cuts = np.flatnonzero((np.diff(wanted) != 1) | (np.diff(which) != 0)) + 1
-        found = [self._read(self.parts[which[at[0]]], wanted[at]) for at in np.split(np.arange(len(wanted)), cuts)]
+        found = [
+            self._read(self.parts[which[at[0]]], wanted[at])
+            for at in np.split(np.arange(len(wanted)), cuts)
+        ]
         return np.concatenate(found)[places.reshape(-1)]
 
     def _read(self, part: FrameRange, rows: I64) -> Pictures:
@@ -100,11 +108,15 @@ class Camera:
         return pictures
 
 
-def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = None) -> NDArray[np.uint8]:
-    """Return all pictures of cameras, decoded with one thread per core, channels first: (N, 3, height, width).
+def decode(
+    cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = None
+) -> NDArray[np.uint8]:
+    """Return all pictures of cameras, decoded with one thread per core, channels first: (N, 3,
+    height, width).
 
-    The array is a memory map of an unnamed temporary file, which is deleted with it. on_frames: called with the number
-    of frames decoded since the last call. Raises `ManipError` if the disk is full.
+    The array is a memory map of an unnamed temporary file, which is deleted with it. on_frames:
+    called with the number of frames decoded since the last call. Raises `ManipError` if the disk is
+    full.
     """
     shape = sum(camera.frames for camera in cameras), 3, *cameras[0].size
     with writing(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
@@ -132,9 +144,14 @@ def decode(cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = 
 
 
 def check_size(found: tuple[int, ...], size: tuple[int, int] | None) -> None:
-    """Raise `ValueError` unless a picture's height and width are those in `info.json`, if these are given."""
+    """Raise `ValueError` unless a picture's height and width are those in `info.json`, if these
+    are given.
+    """
     if size is not None and found != size:
-        raise ValueError(f"its pictures are {found[0]} x {found[1]}; expected {size[0]} x {size[1]}, as in info.json")
+        raise ValueError(
+            f"its pictures are {found[0]} x {found[1]}; expected {size[0]} x {size[1]}, as in"
+            " info.json"
+        )
 
 
 def open_picture(
@@ -195,20 +212,26 @@ def read_frames(container: InputContainer, first: int, count: int, fps: float) -
     # to the last key frame at or before it
     container.seek(round(first / fps / tick), stream=stream)
     pictures: list[Any] = []
-    for frame in itertools.islice(container.decode(stream), first + count):  # bounded even if the file is malicious
+    # bounded even if the file is malicious
+    for frame in itertools.islice(container.decode(stream), first + count):
         ahead = round((frame.pts or 0) * tick * fps) - first - len(pictures)
         if ahead == 0:
             pictures.append(frame.to_ndarray(format="rgb24"))
         if ahead > 0 or len(pictures) == count:
             break
     if len(pictures) != count:
-        raise ValueError(f"it has no frame {first + len(pictures)}; expected frames {first} to {first + count - 1}")
+        raise ValueError(
+            f"it has no frame {first + len(pictures)}; expected frames {first} to"
+            f" {first + count - 1}"
+        )
     return np.stack(pictures)
 
 
 @lru_cache(_OPEN_FILMS)
 def _film(path: Path, changed: int, thread: int, size: tuple[int, int]) -> InputContainer:
-    """Open a video, cached by file, its time of change and thread: opening takes longer than decoding an episode."""
+    """Open a video, cached by file, its time of change and thread: opening takes longer than
+    decoding an episode.
+    """
     return open_video(path, size)
 
 

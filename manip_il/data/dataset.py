@@ -2,7 +2,8 @@
 
 Besides LeRobot's files, our datasets have `meta/manip_il.json` (`own`), which LeRobot's tools drop.
 
-One or more datasets as one training set, with the metadata attributes that LeRobot's factories expect.
+One or more datasets as one training set, with the metadata attributes that LeRobot's factories
+expect.
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ _NUMBERED = (layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
 
 @dataclass(frozen=True)
 class Own:
-    """Content of `meta/manip_il.json`: the spec, the environment's fingerprint, and the origin of the episodes."""
+    """Content of `meta/manip_il.json`: the spec, the environment's fingerprint, and the origin
+    of the episodes.
+    """
 
     spec: s.EnvironmentSpec
     fingerprint: Mapping[str, Any]
@@ -58,7 +61,8 @@ class EpisodeData:
     Its films and statistics of pictures are copied for the cameras that are not among its columns.
 
     Args:
-        columns: (T,) or (T, ...), pictures (T, height, width, 3); stored text and PNG files are Arrow arrays.
+        columns: (T,) or (T, ...), pictures (T, height, width, 3); stored text and PNG files are
+            Arrow arrays.
         tasks: The text of every frame.
         others: Values in the columns of `meta/episodes` that LeRobot does not have.
         dataset: Where it is stored.
@@ -113,7 +117,10 @@ class Dataset:
 
     @cached_property
     def own(self) -> Own | None:
-        """Content of `meta/manip_il.json`; None if there is none, as in a dataset of another program."""
+        """Content of `meta/manip_il.json`.
+
+        None if there is none, as in a dataset of another program.
+        """
         path = self.root / layout.OURS
         if not path.exists():
             return None
@@ -136,19 +143,31 @@ class Dataset:
     def spec(self) -> s.EnvironmentSpec:
         """The dataset's spec.
 
-        For datasets of other programs, and after LeRobot's tools have dropped our file, it is derived from LeRobot's
-        files: the task is `unknown`, and cameras are left out if their sizes differ. Raises `ManipError` for a dataset
-        without actions.
+        For datasets of other programs, and after LeRobot's tools have dropped our file, it is
+        derived from LeRobot's files: the task is `unknown`, and cameras are left out if their sizes
+        differ. Raises `ManipError` for a dataset without actions.
         """
         if self.own is not None:
             one = len(self.tasks) == 1  # otherwise episodes have different instructions
-            return dataclasses.replace(self.own.spec, instruction=self.instruction) if one else self.own.spec
+            return (
+                dataclasses.replace(self.own.spec, instruction=self.instruction)
+                if one
+                else self.own.spec
+            )
         features = self.features
         if s.ACTION not in features:
-            raise ManipError(f"{self.root} has no column {s.ACTION}, so there is nothing to learn from it")
+            raise ManipError(
+                f"{self.root} has no column {s.ACTION}, so there is nothing to learn from it"
+            )
         around = features.get(s.ENVIRONMENT_STATE)
-        cameras = [features[key] for key in self.cameras if key.startswith(s.IMAGES) and features[key].is_rgb]
-        points = next((one.labels for key, one in features.items() if key.startswith(s.KEYPOINTS)), ())
+        cameras = [
+            features[key]
+            for key in self.cameras
+            if key.startswith(s.IMAGES) and features[key].is_rgb
+        ]
+        points = next(
+            (one.labels for key, one in features.items() if key.startswith(s.KEYPOINTS)), ()
+        )
         sizes = {one.picture_size for one in cameras}
         if len(sizes) > 1:  # a spec has one size for all cameras
             cameras = []
@@ -184,7 +203,10 @@ class Dataset:
 
     @cached_property
     def statistics(self) -> Statistics:
-        """Statistics by column and name: (n,), or (channels, 1, 1) for pictures; computed if the dataset has none."""
+        """Statistics by column and name: (n,), or (channels, 1, 1) for pictures.
+
+        Computed if the dataset has none.
+        """
         if (self.root / layout.STATS).exists():
             return read_statistics(self.root)
         return column_statistics(self.columns())
@@ -203,11 +225,15 @@ class Dataset:
             found.append(FrameRange(path, 0, count_rows(path), rows))
             rows += found[-1].count
         if rows != len(self) or not found:
-            raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {rows}")
+            raise ManipError(
+                f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {rows}"
+            )
         return found
 
     def columns(self, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
-        """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors; they may be read-only.
+        """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors.
+
+        They may be read-only.
 
         names: by default all numeric columns. Raises `UnknownName` for an unknown column.
         """
@@ -229,20 +255,25 @@ class Dataset:
     def camera(self, key: str) -> Camera:
         """Find a camera's pictures without decoding them.
 
-        Raises `UnknownName` for a column that is not a camera, and `ManipError` for depth maps or if the dataset's
-        files do not hold each frame exactly once.
+        Raises `UnknownName` for a column that is not a camera, and `ManipError` for depth maps or
+        if the dataset's files do not hold each frame exactly once.
         """
         if key not in self.cameras:
             raise UnknownName(f"camera in {self.root}", key, self.cameras)
         feature = self.features[key]
         if not feature.is_rgb:
-            raise ManipError(f"{key} of {self.root} has shape {feature.shape}; expected RGB pictures")
+            raise ManipError(
+                f"{key} of {self.root} has shape {feature.shape}; expected RGB pictures"
+            )
         films = feature.dtype == "video"
         found = self._film_ranges(key) if films else self._cells
         parts = sorted((part for part in found if part.count), key=lambda part: part.row)
         ends = np.cumsum([0, *(part.count for part in parts)]).tolist()
         if [*(part.row for part in parts), len(self)] != ends:
-            raise ManipError(f"{self.root}: the files of {key} do not hold each of the {len(self)} frames exactly once")
+            raise ManipError(
+                f"{self.root}: the files of {key} do not hold each of the {len(self)} frames"
+                " exactly once"
+            )
         return Camera(key, self.fps, feature.picture_size, films, tuple(parts))
 
     def _film_ranges(self, key: str) -> list[FrameRange]:
@@ -260,25 +291,38 @@ class Dataset:
     def rows_of(self, episode: int) -> I64:
         """Return the rows of an episode, (T,). Raises `UsageError` if it does not exist."""
         if not 0 <= episode < self.info.episodes:
-            raise UsageError(f"{self.root} has no episode {episode}; it has 0 to {self.info.episodes - 1}")
+            raise UsageError(
+                f"{self.root} has no episode {episode}; it has 0 to {self.info.episodes - 1}"
+            )
         table = self.episodes
         [place] = np.flatnonzero(table.index == episode)[:1]
         return np.arange(table.start[place], table.start[place] + table.length[place])
 
     @property
     def stored_features(self) -> layout.Features:
-        """The features in `info.json`, with everything that it says of them, without LeRobot's index columns."""
-        return {key: one.table for key, one in self.features.items() if key not in layout.INDEX_DTYPES}
+        """The features in `info.json`, with everything that it says of them, without LeRobot's
+        index columns.
+        """
+        return {
+            key: one.table for key, one in self.features.items() if key not in layout.INDEX_DTYPES
+        }
 
     @property
     def other_tables(self) -> list[Path]:
         """The tables in `meta/` that are not LeRobot's, such as texts of subtasks."""
-        return [path for path in self.root.glob("meta/*.parquet") if path != self.root / layout.TASKS]
+        return [
+            path for path in self.root.glob("meta/*.parquet") if path != self.root / layout.TASKS
+        ]
 
     def texts(self, numbers: I64) -> list[str]:
-        """Return the task text of each `task_index`, (T,). Raises `ManipError` for an index without a text."""
+        """Return the task text of each `task_index`, (T,).
+
+        Raises `ManipError` for an index without a text.
+        """
         if missing := set(numbers.tolist()) - self.tasks.keys():
-            raise ManipError(f"{self.root}: rows have task {min(missing)}, which {layout.TASKS} lacks")
+            raise ManipError(
+                f"{self.root}: rows have task {min(missing)}, which {layout.TASKS} lacks"
+            )
         return [self.tasks[number] for number in numbers.tolist()]
 
     def stored_episodes(
@@ -286,11 +330,15 @@ class Dataset:
     ) -> Iterator[EpisodeData]:
         """Yield the episodes as they are stored, in order; one data file is in memory at a time.
 
-        names: columns to read, by default all in data files, except the numbers of rows, episodes and tasks. renamed:
-        new names of columns and cameras.
+        names: columns to read, by default all in data files, except the numbers of rows, episodes
+        and tasks. renamed: new names of columns and cameras.
         """
         if names is None:
-            names = [key for key, one in self.features.items() if one.dtype != "video" and key not in _NUMBERED]
+            names = [
+                key
+                for key, one in self.features.items()
+                if one.dtype != "video" and key not in _NUMBERED
+            ]
         new = {key: (renamed or {}).get(key, key) for key in self.features}
         table = self.episodes
         films = {key: self._film_ranges(key) for key in table.clips}
@@ -299,7 +347,9 @@ class Dataset:
         for cells in self._cells:
             columns = self._read(cells.path, [*names, layout.TASK_INDEX])
             texts = self.texts(columns.pop(layout.TASK_INDEX))
-            for place in np.flatnonzero((table.start >= cells.row) & (table.start < cells.row + cells.count)):
+            for place in np.flatnonzero(
+                (table.start >= cells.row) & (table.start < cells.row + cells.count)
+            ):
                 rows = slice(table.start[place] - cells.row, table.stop[place] - cells.row)
                 yield EpisodeData(
                     columns={new[name]: column[rows] for name, column in columns.items()},
@@ -320,8 +370,12 @@ class Dataset:
         return len(np.unique(index[success.astype(bool)]))
 
 
-def joined_columns(datasets: Sequence[Dataset | Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Read and concatenate columns, (T,) or (T, d), of several datasets; frames and episodes are renumbered.
+def joined_columns(
+    datasets: Sequence[Dataset | Path], names: Sequence[str]
+) -> dict[str, NDArray[Any]]:
+    """Read and concatenate columns, (T,) or (T, d), of several datasets.
+
+    Frames and episodes are renumbered.
 
     Raises what `Dataset.columns` raises.
     """
@@ -346,9 +400,9 @@ _IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}
 class JoinedDatasets:
     """Several datasets; frames are numbered in the given order.
 
-    features: LeRobot's table of the columns and cameras that every dataset has, with equal shapes and without depth.
-    stats: over all frames. Cameras have ImageNet's mean and std, as in `lerobot-train`; their other statistics are the
-    first dataset's. tasks: each text once.
+    features: LeRobot's table of the columns and cameras that every dataset has, with equal shapes
+    and without depth. stats: over all frames. Cameras have ImageNet's mean and std, as in
+    `lerobot-train`; their other statistics are the first dataset's. tasks: each text once.
     """
 
     table: dict[str, NDArray[Any]]  # numeric columns, once training has read them
@@ -360,16 +414,22 @@ class JoinedDatasets:
         self.features: Features = {
             key: {"dtype": one.dtype, "shape": one.shape, "names": one.names}
             for key, one in first.features.items()
-            if all(key in other.features and other.features[key].shape == one.shape for other in self.datasets)
+            if all(
+                key in other.features and other.features[key].shape == one.shape
+                for other in self.datasets
+            )
             and (one.is_rgb or one.dtype not in PICTURES)
         }
         self.camera_keys = [key for key, one in self.features.items() if one["dtype"] in PICTURES]
         self.total_frames = sum(map(len, self.datasets))
         self.stats = self._statistics()
-        self.tasks = list(dict.fromkeys(text for one in self.datasets for text in one.tasks.values()))
+        self.tasks = list(
+            dict.fromkeys(text for one in self.datasets for text in one.tasks.values())
+        )
 
     def joint_tasks(self, own: I64) -> I64:
-        """Return every frame's index in `tasks`, (N,), given its `task_index` in its own dataset, (N,).
+        """Return every frame's index in `tasks`, (N,), given its `task_index` in its own dataset,
+        (N,).
 
         Raises `ManipError` for an index without a text.
         """
@@ -381,6 +441,11 @@ class JoinedDatasets:
     def _statistics(self) -> Statistics:
         pooled = reduce(pool, (one.statistics for one in self.datasets))
         numbers = {key: pooled[key] for key in self.features if key in pooled}
-        imagenet = {name: np.array(values, np.float32).reshape(3, 1, 1) for name, values in _IMAGENET.items()}
-        cameras = {key: self.datasets[0].statistics.get(key, {}) | imagenet for key in self.camera_keys}
+        imagenet = {
+            name: np.array(values, np.float32).reshape(3, 1, 1)
+            for name, values in _IMAGENET.items()
+        }
+        cameras = {
+            key: self.datasets[0].statistics.get(key, {}) | imagenet for key in self.camera_keys
+        }
         return numbers | cameras

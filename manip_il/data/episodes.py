@@ -1,7 +1,8 @@
-"""Turn transitions into rollouts with a dataset's columns, and rollouts into the episodes of a dataset.
+"""Turn transitions into rollouts with a dataset's columns, and rollouts into the episodes of a
+dataset.
 
-One rollout is one `Episode`: the learner's path, followed by the expert's takeover or branches. Each of these parts
-ends with `next.done`; in a dataset each is an episode (`parts`).
+One rollout is one `Episode`: the learner's path, followed by the expert's takeover or branches.
+Each of these parts ends with `next.done`; in a dataset each is an episode (`parts`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,7 +17,10 @@ from manip_il.mdp import Episode, Transition
 
 
 def group_rollouts(transitions: Iterable[Transition]) -> Iterator[list[Transition]]:
-    """Group interleaved transitions by rollout; yield each group when its last transition arrives."""
+    """Group interleaved transitions by rollout.
+
+    Yield each group when its last transition arrives.
+    """
     running: dict[int, list[Transition]] = {}
     for transition in transitions:
         frames = running.setdefault(transition.seed, [])
@@ -33,17 +37,21 @@ def to_episode(
     labelled: bool = True,
     path: int | None = None,
 ) -> Episode:
-    """Return an episode with the schema's columns, (T, 1) or (T, d), pictures (T, height, width, 3).
+    """Return an episode with the schema's columns, (T, 1) or (T, d), pictures (T, height, width,
+    3).
 
     Args:
         frames: Of one rollout, in order.
         round_: Number of the round of DAgger.
         beta: Probability that the expert drove.
-        labelled: Whether to include the columns of labels; frames without a label have `label_valid` 0, phase 0, and
-            the executed action as label.
+        labelled: Whether to include the columns of labels; frames without a label have
+            `label_valid` 0, phase 0, and the executed action as label.
         path: Number of leading frames that decide success; by default all.
     """
-    rows = [_row(frame, labelled=labelled) | {schema.ROUND: round_, schema.BETA: beta} for frame in frames]
+    rows = [
+        _row(frame, labelled=labelled) | {schema.ROUND: round_, schema.BETA: beta}
+        for frame in frames
+    ]
     columns: dict[str, NDArray[Any]] = {}
     for key in rows[0]:
         column = np.array([row[key] for row in rows])

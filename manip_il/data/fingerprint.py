@@ -9,7 +9,8 @@ from manip_il import checks
 
 _HASH = 12  # printed characters of a hash
 _LONGEST = 80  # printed characters of any other value
-_FOR_PEOPLE = ("README.md", "train_config.json")  # saved beside a policy, but not part of how it acts
+# saved beside a policy, but not part of how it acts
+_FOR_PEOPLE = ("README.md", "train_config.json")
 
 
 def compare_fingerprints(
@@ -33,7 +34,9 @@ def file_sha256(path: Path) -> bytes:
 
 
 def policy_sha256(policy: Path) -> str:
-    """Return the SHA-256 of everything in a policy's folder that decides how it acts, independent of its path."""
+    """Return the SHA-256 of everything in a policy's folder that decides how it acts,
+    independent of its path.
+    """
     digest = hashlib.sha256()
     for path in sorted(policy.iterdir()):
         if path.is_file() and path.name not in _FOR_PEOPLE:

@@ -1,8 +1,11 @@
-"""Encode columns as messages that Foxglove shows without settings, one per frame and topic; decode pictures.
+"""Encode columns as messages that Foxglove shows without settings, one per frame and topic.
+
+Decode pictures.
 
 Schemas: Foxglove's own in protobuf (`JointStates`, `RawImage`, `Log`), LeRobot's scalars in JSON.
-Numbers and pictures keep every bit. Pictures are stored raw and compressed by the file's zstd, which exploits the
-similarity of successive frames: rendered frames of 128 x 128 took a third of a PNG's bytes and a fifth of its time.
+Numbers and pictures keep every bit. Pictures are stored raw and compressed by the file's zstd,
+which exploits the similarity of successive frames: rendered frames of 128 x 128 took a third of a
+PNG's bytes and a fifth of its time.
 """
 
 import json
@@ -41,8 +44,9 @@ _SCALARS = (s.ACTOR, s.EXPERT_PHASE, s.LABEL_VALID, s.REWARD, s.SUCCESS, s.DONE)
 # copied from LeRobot (`lerobot.utils.foxglove_visualization`)
 _SCALARS_NAME = "lerobot.Scalars"
 _SCALARS_SCHEMA = (
-    b'{"type": "object", "title": "lerobot.Scalars", "properties": {"scalars": {"type": "array", "items": '
-    b'{"type": "object", "properties": {"label": {"type": "string"}, "value": {"type": "number"}}}}}}'
+    b'{"type": "object", "title": "lerobot.Scalars", "properties": {"scalars": {"type": "array",'
+    b' "items": {"type": "object", "properties": {"label": {"type": "string"}, "value": {"type":'
+    b' "number"}}}}}}'
 )
 
 
@@ -54,12 +58,17 @@ def frame_times(count: int, rate: Fraction) -> list[int]:
 def joint_states(names: Sequence[str], values: NDArray[Any], times: Times) -> Messages:
     """Yield one message per row of the positions (T, n) of named joints."""
     for time, row in zip(times, values.tolist(), strict=True):
-        joints = [JointState(name=name, position=position) for name, position in zip(names, row, strict=True)]
+        joints = [
+            JointState(name=name, position=position)
+            for name, position in zip(names, row, strict=True)
+        ]
         yield JointStates(timestamp=_stamp(time), joints=joints)
 
 
 def scalars(labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Messages:
-    """Yield one JSON message of labelled numbers per row. rows: T rows of Python numbers, which must be finite."""
+    """Yield one JSON message of labelled numbers per row. rows: T rows of Python numbers, which
+    must be finite.
+    """
     for row in rows:
         pairs = zip(labels, row, strict=True)
         # + for bools
@@ -95,7 +104,11 @@ def _stamp(time: int) -> Timestamp:
 def episode_channels(episode: Episode, times: Times, joints: Sequence[str]) -> dict[str, Messages]:
     """Return the messages of the episode's columns by topic. joints: the names of the joints."""
     columns = episode.columns
-    found = {topic: joint_states(joints, columns[key], times) for topic, key in _JOINT_TOPICS.items() if key in columns}
+    found = {
+        topic: joint_states(joints, columns[key], times)
+        for topic, key in _JOINT_TOPICS.items()
+        if key in columns
+    }
     if numbers := {key: columns[key].reshape(-1) for key in _SCALARS if key in columns}:
         rows = zip(*(column.tolist() for column in numbers.values()), strict=True)
         found["/scalars"] = scalars(list(numbers), rows)
@@ -110,15 +123,27 @@ def add_channels(writer: Writer, channels: Mapping[str, Messages], times: Times)
     """Write all messages, frame by frame. channels: topic -> messages."""
     schemas: dict[type, int] = {}  # class of messages -> its schema
     ids: dict[str, int] = {}
-    for frame, (time, messages) in enumerate(zip(times, zip(*channels.values(), strict=True), strict=bool(channels))):
+    for frame, (time, messages) in enumerate(
+        zip(times, zip(*channels.values(), strict=True), strict=bool(channels))
+    ):
         for topic, message in zip(channels, messages, strict=True):
             kind = type(message)
             if kind not in schemas:
                 scalars = _SCALARS_NAME, "jsonschema", _SCALARS_SCHEMA
-                schemas[kind] = writer.register_schema(*scalars) if kind is str else register_schema(writer, kind)
+                schemas[kind] = (
+                    writer.register_schema(*scalars)
+                    if kind is str
+                    else register_schema(writer, kind)
+                )
             if topic not in ids:
-                ids[topic] = writer.register_channel(topic, "json" if kind is str else "protobuf", schemas[kind])
-            data = message.encode() if isinstance(message, str) else message.SerializeToString(deterministic=True)
+                ids[topic] = writer.register_channel(
+                    topic, "json" if kind is str else "protobuf", schemas[kind]
+                )
+            data = (
+                message.encode()
+                if isinstance(message, str)
+                else message.SerializeToString(deterministic=True)
+            )
             writer.add_message(ids[topic], time, data, time, frame)
 
 

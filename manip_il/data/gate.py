@@ -1,8 +1,10 @@
-"""The gate for untrusted datasets: every file is opened once in a child process with limited memory and time.
+"""The gate for untrusted datasets: every file is opened once in a child process with limited memory
+and time.
 
-Other readers decode a column as the parquet file's metadata says (audio, PDF, any format that Pillow knows). If a cell
-for a picture has no bytes, they open its `path`, even a URL. Only what LeRobot and this program write passes: pictures
-in data files, in the columns that `info.json` calls images, and plain values and lists everywhere else.
+Other readers decode a column as the parquet file's metadata says (audio, PDF, any format that
+Pillow knows). If a cell for a picture has no bytes, they open its `path`, even a URL. Only what
+LeRobot and this program write passes: pictures in data files, in the columns that `info.json` calls
+images, and plain values and lists everywhere else.
 """
 
 import json
@@ -33,17 +35,24 @@ _BATCH = 64  # rows in memory at once
 
 
 def check_arrived(root: Path) -> None:
-    """Open every file of a dataset in a child process. Raises `ManipError` naming a file that is refused."""
+    """Open every file of a dataset in a child process.
+
+    Raises `ManipError` naming a file that is refused.
+    """
     checks.in_child(str(root), open_files, root)
 
 
 def open_files(root: Path) -> None:
-    """Open every file of a dataset, in the child process. Raises `ManipError` as `check_arrived` does."""
+    """Open every file of a dataset, in the child process.
+
+    Raises `ManipError` as `check_arrived` does.
+    """
     features = read_info(root).features
     for path in sorted(path for path in root.rglob("*") if not path.is_dir()):
         if not path.is_file():
             raise ManipError(
-                f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or broken links"
+                f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or"
+                " broken links"
             )
         checks.opening(str(path))
         try:
@@ -82,10 +91,12 @@ def _open_file(path: Path, folder: str, features: Mapping[str, Feature]) -> None
 
 
 def _check_columns(schema: pa.Schema, pictures: Collection[str], structs: Collection[str]) -> None:
-    """Raise `ValueError` if a column has another type, or readers would decode it otherwise, than `info.json` says.
+    """Raise `ValueError` if a column has another type, or readers would decode it otherwise, than
+    `info.json` says.
 
     Args:
-        schema: The columns' types, and the metadata from which Hugging Face's `datasets` decodes them.
+        schema: The columns' types, and the metadata from which Hugging Face's `datasets` decodes
+            them.
         pictures: The columns of pictures.
         structs: The columns that may hold structs.
     """
@@ -96,11 +107,15 @@ def _check_columns(schema: pa.Schema, pictures: Collection[str], structs: Collec
     for key, feature in (about.get("info", {}).get("features") or {}).items():
         allowed = (*_PLAIN, "Image") if key in pictures else _PLAIN
         if not {*_TYPE.findall(json.dumps(feature))} <= {*allowed}:
-            raise ValueError(f"column {key!r} is decoded as {checks.shorten(feature)}; expected plain values")
+            raise ValueError(
+                f"column {key!r} is decoded as {checks.shorten(feature)}; expected plain values"
+            )
 
 
 def _is_plain(column: pa.Field, structs: bool) -> bool:
-    """Return whether a column's type consists of plain values, lists and, if they are allowed, structs."""
+    """Return whether a column's type consists of plain values, lists and, if they are allowed,
+    structs.
+    """
     kind, extension = column.type, (column.metadata or {}).get(b"ARROW:extension:name")
     if extension is not None and not _ARRAY.fullmatch(extension):
         return False
@@ -112,7 +127,9 @@ def _is_plain(column: pa.Field, structs: bool) -> bool:
 
 
 def _check_cells(camera: Feature, cells: pa.Array, first: int) -> None:
-    """Raise `ValueError` unless every cell holds a picture of the camera's size. first: row of the first cell."""
+    """Raise `ValueError` unless every cell holds a picture of the camera's size. first: row of
+    the first cell.
+    """
     contents: Any = pc.struct_field(cells, "bytes")  # pyright: ignore[reportAttributeAccessIssue]
     for row, content in enumerate(contents.to_pylist(), first):
         try:

@@ -48,21 +48,38 @@ class Feature:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A name for each value: from `info.json` (a list, or lists by group), else `<column>.<index>`."""
+        """A name for each value: from `info.json` (a list, or lists by group), else
+        `<column>.<index>`.
+        """
         names: Any = self.names
         groups = cast(dict[str, Any], names).values() if isinstance(names, dict) else [names]
-        found = [str(name) for group in groups if isinstance(group, list) for name in cast(list[Any], group)]
-        return tuple(found) if len(found) == self.size else tuple(f"{self.key}.{place}" for place in range(self.size))
+        found = [
+            str(name)
+            for group in groups
+            if isinstance(group, list)
+            for name in cast(list[Any], group)
+        ]
+        return (
+            tuple(found)
+            if len(found) == self.size
+            else tuple(f"{self.key}.{place}" for place in range(self.size))
+        )
 
     @property
     def is_rgb(self) -> bool:
         """Whether it is a camera with RGB pictures, not depth."""
         depth = self.details.get("is_depth_map") or self.details.get("video.is_depth_map")
-        return self.dtype in PICTURES and 3 * math.prod(self.picture_size) == self.size > 0 and not depth
+        return (
+            self.dtype in PICTURES
+            and 3 * math.prod(self.picture_size) == self.size > 0
+            and not depth
+        )
 
     @property
     def picture_size(self) -> tuple[int, int]:
-        """A picture's height and width [pixels]: the axes named `height` and `width`, else the first two axes."""
+        """A picture's height and width [pixels]: the axes named `height` and `width`, else the
+        first two axes.
+        """
         names = cast(list[Any], self.names) if isinstance(self.names, list) else []
         if "height" in names and "width" in names and len(names) == len(self.shape):
             return self.shape[names.index("height")], self.shape[names.index("width")]
@@ -87,20 +104,25 @@ class Info:
 
 @contextmanager
 def reading(path: Path) -> Generator[None]:
-    """Turn every error raised while a file is read into a one-line `ManipError` that names the file."""
+    """Turn every error raised while a file is read into a one-line `ManipError` that names the
+    file.
+    """
     try:
         yield
     except Exception as error:  # libraries raise anything, depending on the file
         if isinstance(error, ManipError) and str(path) in str(error):
             raise
         reason = getattr(error, "strerror", None) or checks.one_line(error) or type(error).__name__
-        raise ManipError(f"cannot read {path}: {reason}; run `manip-il data check` to see what is wrong") from error
+        raise ManipError(
+            f"cannot read {path}: {reason}; run `manip-il data check` to see what is wrong"
+        ) from error
 
 
 def read_info(root: Path) -> Info:
     """Read `meta/info.json` of a dataset.
 
-    Raises `ManipError` if it is missing, has another version, or names files otherwise than LeRobot does.
+    Raises `ManipError` if it is missing, has another version, or names files otherwise than LeRobot
+    does.
     """
     path = root / layout.INFO
     if not path.exists():
@@ -109,11 +131,17 @@ def read_info(root: Path) -> Info:
     version = raw.get("codebase_version")
     if version != layout.VERSION:
         older = "; LeRobot converts datasets of v2.1" if version == "v2.1" else ""
-        raise ManipError(f"{path}: codebase_version is {checks.shorten(version)}; expected {layout.VERSION!r}{older}")
+        raise ManipError(
+            f"{path}: codebase_version is {checks.shorten(version)}; expected"
+            f" {layout.VERSION!r}{older}"
+        )
     with reading(path):
         for key, template in _PATHS.items():
             if (found := raw.get(key) or template) != template:
-                raise ManipError(f"{key} is {checks.shorten(found)}; expected {template!r}, as LeRobot names its files")
+                raise ManipError(
+                    f"{key} is {checks.shorten(found)}; expected {template!r}, as LeRobot names its"
+                    " files"
+                )
         tasks = raw.get("total_tasks")
         return Info(
             fps=checks.number("fps", raw["fps"], 1, 1e6),

@@ -1,7 +1,8 @@
 """Journals: one crash-safe MCAP file for every finished episode.
 
-A file is written under a temporary name, synced and renamed, so it is complete or absent. Every column is kept bit for
-bit: numbers as an attachment (`<column>.npy`), pictures as messages. Foxglove shows all messages.
+A file is written under a temporary name, synced and renamed, so it is complete or absent. Every
+column is kept bit for bit: numbers as an attachment (`<column>.npy`), pictures as messages.
+Foxglove shows all messages.
 """
 
 import json
@@ -56,12 +57,17 @@ class Journal:
             if not key.startswith(IMAGES):  # pictures are stored as lossless messages
                 numbers = BytesIO()
                 np.save(numbers, column, allow_pickle=False)
-                writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", numbers.getvalue())
+                writer.add_attachment(
+                    0, 0, key + _NPY, "application/octet-stream", numbers.getvalue()
+                )
         writer.finish()
         return stream.getvalue()
 
     def store(self, seed: int, content: bytes) -> Path:
-        """Write the bytes from `encode` to disk, replacing an earlier file of the seed; return its path."""
+        """Write the bytes from `encode` to disk, replacing an earlier file of the seed.
+
+        Return its path.
+        """
         path = episode_path(self.folder, seed)
         write_file(path, content)
         return path
@@ -73,8 +79,9 @@ class Journal:
     def prepare(self) -> list[str]:
         """Check that episodes can be added to the folder; return warnings to show.
 
-        Removes unfinished files of killed writers, so no other writer may be running. Checks the first journal only:
-        raises `MismatchError` if it has another robot, task or cameras, and what `read_journal` raises.
+        Removes unfinished files of killed writers, so no other writer may be running. Checks the
+        first journal only: raises `MismatchError` if it has another robot, task or cameras, and
+        what `read_journal` raises.
         """
         for leftover in self.folder.glob(f".episode-*{PARTIAL}"):
             leftover.unlink(missing_ok=True)
@@ -83,7 +90,9 @@ class Journal:
         there, _ = read_journal(paths[0])
         here, also = f"{self.spec.robot} {self.spec.task}", ("task", "cameras", "image_size")
         check_same_spec(str(self.folder), there.spec, here, self.spec, also)
-        return compare_fingerprints(str(self.folder), there.fingerprint, "this machine", self.fingerprint)
+        return compare_fingerprints(
+            str(self.folder), there.fingerprint, "this machine", self.fingerprint
+        )
 
 
 def episode_path(folder: Path, seed: int) -> Path:
@@ -92,8 +101,15 @@ def episode_path(folder: Path, seed: int) -> Path:
 
 
 def list_seeds(folder: Path) -> list[int]:
-    """Return the seeds of the folder's finished episodes, in order; [] if the folder does not exist."""
-    return sorted(int(match[1]) for path in folder.glob("episode-*.mcap") if (match := _NAME.fullmatch(path.name)))
+    """Return the seeds of the folder's finished episodes, in order.
+
+    [] if the folder does not exist.
+    """
+    return sorted(
+        int(match[1])
+        for path in folder.glob("episode-*.mcap")
+        if (match := _NAME.fullmatch(path.name))
+    )
 
 
 def list_episodes(folder: Path) -> list[Path]:
@@ -104,12 +120,14 @@ def list_episodes(folder: Path) -> list[Path]:
 def read_journal(path: Path) -> tuple[Journal, Episode]:
     """Read an episode, bit for bit, and the description of its environment.
 
-    Raises `ManipError` naming the file if it is truncated, changed, not ours or of an older version.
+    Raises `ManipError` naming the file if it is truncated, changed, not ours or of an older
+    version.
     """
     try:
         with checks.open_outside(path, "a journal") as stream:
             return _read(path.parent, stream)
-    except Exception as error:  # a foreign file with valid checksums can make a parser raise anything
+    # a foreign file with valid checksums can make a parser raise anything
+    except Exception as error:
         why = checks.one_line(error) or type(error).__name__
         again = "delete it; --resume=true records it again"
         raise ManipError(f"{path} is not a complete episode: {why}; {again}") from error
@@ -123,7 +141,9 @@ def _read(folder: Path, stream: BinaryIO) -> tuple[Journal, Episode]:
         if isinstance(record, Metadata) and record.name == _RECORD:
             values = {name: json.loads(text) for name, text in record.metadata.items()}
         elif isinstance(record, Attachment):
-            columns[record.name.removesuffix(_NPY)] = np.load(BytesIO(record.data), allow_pickle=False)
+            columns[record.name.removesuffix(_NPY)] = np.load(
+                BytesIO(record.data), allow_pickle=False
+            )
         elif isinstance(record, DataEnd):  # all checksums were verified
             break
     if (found := str(values.pop("format", None))) != _FORMAT:

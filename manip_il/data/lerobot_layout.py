@@ -1,6 +1,8 @@
-"""Paths of a LeRobot v3.0 dataset and the Arrow types of its columns (lerobot 0.6.1, `datasets/utils.py`).
+"""Paths of a LeRobot v3.0 dataset and the Arrow types of its columns (lerobot 0.6.1,
+`datasets/utils.py`).
 
-Copied here (and tests compare the two), because importing `lerobot.datasets` imports torch, which takes seconds.
+Copied here (and tests compare the two), because importing `lerobot.datasets` imports torch, which
+takes seconds.
 """
 
 import json
@@ -32,25 +34,28 @@ INDEX = "index"
 TASK_INDEX = "task_index"
 DRAWN = "drawn"  # our column in meta/episodes: an episode's random draws, as JSON
 
-INDEX_DTYPES = {TIMESTAMP: "float32"} | dict.fromkeys((FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX), "int64")
+INDEX_DTYPES = {TIMESTAMP: "float32"} | dict.fromkeys(
+    (FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX), "int64"
+)
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 # a file's content and its original name
 PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
 _TASK_IS_INDEX = (  # in pandas' words
-    '{"index_columns": ["task"], "column_indexes": [], "columns": ['
-    '{"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", '
-    '"metadata": null}, '
-    '{"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": null}], '
-    '"pandas_version": "2.3.3"}'
+    '{"index_columns": ["task"], "column_indexes": [], "columns": [{"name": "task_index",'
+    ' "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": null},'
+    ' {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object",'
+    ' "metadata": null}], "pandas_version": "2.3.3"}'
 )
 STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
 def data_schema(features: Features, columns: Mapping[str, Any]) -> pa.Schema:
-    """Return the Arrow schema of the data files: shape (1,) becomes a plain value, a vector a list of fixed size.
+    """Return the Arrow schema of the data files: shape (1,) becomes a plain value, a vector a list
+    of fixed size.
 
-    Its metadata describes the columns in the form that Hugging Face's package `datasets` reads. columns: those of an
-    episode; types that are not LeRobot's for numbers, text or pictures, such as language, are kept.
+    Its metadata describes the columns in the form that Hugging Face's package `datasets` reads.
+    columns: those of an episode; types that are not LeRobot's for numbers, text or pictures, such
+    as language, are kept.
     """
     types: dict[str, pa.DataType] = {}
     hugging_face: dict[str, Any] = {}
@@ -79,14 +84,18 @@ def data_schema(features: Features, columns: Mapping[str, Any]) -> pa.Schema:
 
 
 def tasks_table(instructions: Sequence[str]) -> pa.Table:
-    """Return the table of tasks, with `task` as pandas' index, because LeRobot looks tasks up by this index."""
+    """Return the table of tasks, with `task` as pandas' index, because LeRobot looks tasks up by
+    this index.
+    """
     numbers = pa.array(range(len(instructions)), pa.int64())
     table = pa.table({TASK_INDEX: numbers, "task": pa.array(instructions, pa.string())})
     return table.replace_schema_metadata({"pandas": _TASK_IS_INDEX})
 
 
 def numbered(template: str, number: int, **names: str) -> tuple[str, int, int]:
-    """Return path, chunk index and file index of file `number`. names: values of the template's other fields."""
+    """Return path, chunk index and file index of file `number`. names: values of the template's
+    other fields.
+    """
     chunk, file = divmod(number, CHUNKS_SIZE)
     return template.format(chunk_index=chunk, file_index=file, **names), chunk, file
 

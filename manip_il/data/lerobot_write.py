@@ -1,7 +1,8 @@
 """Write LeRobot v3.0 datasets with pyarrow and PyAV, episode by episode, in constant memory.
 
-LeRobot's own writer takes 80 to 160 ms per episode and loses all of them when it is killed. This one writes the same
-files in a few milliseconds per episode, and the dataset appears complete or not at all. Tests read it with LeRobot.
+LeRobot's own writer takes 80 to 160 ms per episode and loses all of them when it is killed. This
+one writes the same files in a few milliseconds per episode, and the dataset appears complete or not
+at all. Tests read it with LeRobot.
 """
 
 import itertools
@@ -53,7 +54,9 @@ def write_dataset(
     video: VideoConfig = VideoConfig(),  # noqa: B008  # frozen
     replace: bool = False,
 ) -> Info:
-    """Write a dataset with our columns; the same episodes in the same order give the same bytes, videos included.
+    """Write a dataset with our columns.
+
+    The same episodes in the same order give the same bytes, videos included.
 
     Args:
         episodes: Taken one by one and not kept.
@@ -74,14 +77,18 @@ def write_dataset(
         for episode in episodes:
             columns = episode.columns
             if table.keys() != columns.keys():
-                raise MismatchError("list of columns", f"seed {episode.seed}", [*columns], "the dataset", [*table])
+                raise MismatchError(
+                    "list of columns", f"seed {episode.seed}", [*columns], "the dataset", [*table]
+                )
             text = checks.text("instruction", episode.instruction or spec.instruction)
             drawn = {layout.DRAWN: json.dumps(dict(episode.drawn))}
             yield EpisodeData(columns, [text] * len(episode), drawn)
 
     own = Own(spec, fingerprint, {} if provenance is None else provenance)
     robot = spec.robot_type or spec.robot
-    return write_episodes(described(), root, table, spec.fps, robot, own, video=video, replace=replace)
+    return write_episodes(
+        described(), root, table, spec.fps, robot, own, video=video, replace=replace
+    )
 
 
 def write_episodes(
@@ -110,7 +117,8 @@ def write_episodes(
         replace: Replace a dataset of ours.
 
     Raises:
-        FolderExistsError: `root` is not empty, and `replace` is not given; before an episode is taken.
+        FolderExistsError: `root` is not empty, and `replace` is not given; before an episode is
+            taken.
         ManipError: There are no episodes, or the disk is full.
     """
     with new_folder(root, replaces=DATASET if replace else "") as folder:
@@ -119,7 +127,8 @@ def write_episodes(
             with checks.native_path(path, "a table") as opened:
                 shutil.copyfile(opened, folder / "meta" / path.name)
         if own is not None:
-            name = f"local/{own.spec.robot}_{own.spec.task}"  # nothing reads it, but every version has written it
+            # nothing reads it, but every version has written it
+            name = f"local/{own.spec.robot}_{own.spec.task}"
             ours = {"format": _FORMAT, "repo_id": name, "spec": own.spec.to_json()}
             ours |= {"fingerprint": dict(own.fingerprint), "provenance": dict(own.provenance)}
             layout.write_json(folder / layout.OURS, ours)
@@ -146,18 +155,27 @@ def _write_tables(
 ) -> None:
     """Write all of LeRobot's files into a folder."""
     index: layout.Features = {
-        key: {"dtype": kind, "shape": (1,), "names": None} for key, kind in layout.INDEX_DTYPES.items()
+        key: {"dtype": kind, "shape": (1,), "names": None}
+        for key, kind in layout.INDEX_DTYPES.items()
     }
-    features = {key: {**one, "shape": tuple(one["shape"])} for key, one in {**features, **index}.items()}
+    features = {
+        key: {**one, "shape": tuple(one["shape"])} for key, one in {**features, **index}.items()
+    }
     fps = plain_rate(fps)
     data = ParquetFiles(folder, layout.DATA_PATH, _GROUP_ROWS)
     meta = ParquetFiles(folder, layout.EPISODES_PATH)
-    films = {key: CameraFiles(folder, key, video, fps) for key, one in features.items() if one["dtype"] == "video"}
+    films = {
+        key: CameraFiles(folder, key, video, fps)
+        for key, one in features.items()
+        if one["dtype"] == "video"
+    }
     files = (data, meta, *films.values())
     totals = _Totals()
     try:
         schema: pa.Schema | None = None  # that of the first rows
-        for rows in itertools.batched(_rows(episodes, features, fps, data, films, totals), _GROUP_EPISODES):
+        for rows in itertools.batched(
+            _rows(episodes, features, fps, data, films, totals), _GROUP_EPISODES
+        ):
             chunk, file = meta.next_place()
             place = {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
             table = pa.Table.from_pylist([row | place for row in rows], schema)
@@ -253,7 +271,8 @@ def _fit(
         if key not in given:  # a film that is copied
             continue
         values = given[key]
-        if feature["dtype"] == "video" and isinstance(values, pa.ChunkedArray):  # PNGs become a film
+        # PNGs become a film
+        if feature["dtype"] == "video" and isinstance(values, pa.ChunkedArray):
             with reading(Path(key)):
                 values = np.stack([decode_picture(cell["bytes"]) for cell in values.to_pylist()])
         if isinstance(values, np.ndarray):

@@ -1,7 +1,9 @@
-"""Parquet files of datasets: write numbered files by row groups, read columns, tasks and the table of episodes.
+"""Parquet files of datasets: write numbered files by row groups, read columns, tasks and the table
+of episodes.
 
-The random draws of an episode are a column of ours in `meta/episodes`, one JSON object per episode. LeRobot's merge
-keeps the column, its split and delete drop it; the draws are also part of `sim_state`.
+The random draws of an episode are a column of ours in `meta/episodes`, one JSON object per episode.
+LeRobot's merge keeps the column, its split and delete drop it; the draws are also part of
+`sim_state`.
 """
 
 import re
@@ -28,14 +30,17 @@ from manip_il.mdp import F64, I64
 Column = Any  # numpy array, (T,) or (T, ...); of datasets, all but numbers are Arrow arrays
 
 # LeRobot's columns of `meta/episodes`
-_EPISODE_COLUMNS = re.compile(r"episode_index|tasks|length|dataset_(from|to)_index|(data|meta|stats|videos)/.*")
+_EPISODE_COLUMNS = re.compile(
+    r"episode_index|tasks|length|dataset_(from|to)_index|(data|meta|stats|videos)/.*"
+)
 
 
 class ParquetFiles:
     """Writes numbered parquet files, one at a time: when a file is full, the next one is started.
 
-    group_rows: least number of rows in a row group; a file's last one may have fewer. A writer keeps a description of
-    every row group in memory until the file is closed, so many small groups would need more memory than the rows.
+    group_rows: least number of rows in a row group; a file's last one may have fewer. A writer
+    keeps a description of every row group in memory until the file is closed, so many small groups
+    would need more memory than the rows.
     """
 
     def __init__(self, folder: Path, template: str, group_rows: int = 1):
@@ -79,7 +84,9 @@ class ParquetFiles:
         if self._writer is None:
             self._path = self._folder / layout.numbered(self._template, self._number)[0]
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            repeating: Any = [field.name for field in table.schema if not pa.types.is_nested(field.type)]
+            repeating: Any = [
+                field.name for field in table.schema if not pa.types.is_nested(field.type)
+            ]
             self._writer = pq.ParquetWriter(
                 *(self._path, table.schema),
                 compression="snappy",
@@ -97,12 +104,18 @@ def to_table(columns: Mapping[str, Column], schema: pa.Schema) -> pa.Table:
         if isinstance(values, pa.ChunkedArray):
             arrays.append(values.cast(column.type))
         elif column.type == layout.PICTURE:
-            arrays.append(pa.array([{"bytes": _to_png(picture), "path": None} for picture in values], column.type))
+            arrays.append(
+                pa.array(
+                    [{"bytes": _to_png(picture), "path": None} for picture in values], column.type
+                )
+            )
         elif values.ndim > 2:
             arrays.append(pa.array(values.tolist(), column.type))
         elif values.ndim > 1:
             flat = pa.array(np.ascontiguousarray(values).reshape(-1), column.type.value_type)
-            arrays.append(pa.FixedSizeListArray.from_arrays(flat, values.shape[1]).cast(column.type))
+            arrays.append(
+                pa.FixedSizeListArray.from_arrays(flat, values.shape[1]).cast(column.type)
+            )
         else:
             arrays.append(pa.array(values, column.type))
     return pa.Table.from_arrays(arrays, schema=schema)
@@ -147,7 +160,10 @@ def read_file(path: Path, columns: Sequence[str]) -> pa.Table:
 
 
 def read_tasks(root: Path) -> dict[int, str]:
-    """Return the task texts by `task_index`. The file has them in pandas' index column, which may have no name."""
+    """Return the task texts by `task_index`.
+
+    The file has them in pandas' index column, which may have no name.
+    """
     path = root / layout.TASKS
     with reading(path):
         names = column_names(path)
@@ -163,7 +179,9 @@ def read_tasks(root: Path) -> dict[int, str]:
 
 
 def to_numpy(column: pa.ChunkedArray, feature: Feature) -> Column:
-    """Return a column of numbers, (T,) or (T, *shape), with its feature's dtype; others as they are.
+    """Return a column of numbers, (T,) or (T, *shape), with its feature's dtype.
+
+    Others as they are.
 
     Raises `ValueError` if values have another kind or shape, or are missing.
     """
@@ -175,16 +193,22 @@ def to_numpy(column: pa.ChunkedArray, feature: Feature) -> Column:
         array = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten()
         is_vector = True
     try:  # files may hold narrower numbers
-        values = array.to_numpy(zero_copy_only=False).astype(feature.dtype, casting="same_kind", copy=False)
+        values = array.to_numpy(zero_copy_only=False).astype(
+            feature.dtype, casting="same_kind", copy=False
+        )
         return values.reshape(len(column), *feature.shape if is_vector else ())
     except (TypeError, ValueError) as error:
         what = f"{feature.dtype} of shape {list(feature.shape)}"
-        raise ValueError(f"{feature.key!r} does not hold {what} in each of {len(column):,} rows: {error}") from error
+        raise ValueError(
+            f"{feature.key!r} does not hold {what} in each of {len(column):,} rows: {error}"
+        ) from error
 
 
 @dataclass(frozen=True)
 class VideoSpans:
-    """Where one camera's episodes are, one entry per episode: the video file, and the start in it [s]."""
+    """Where one camera's episodes are, one entry per episode: the video file, and the start in
+    it [s].
+    """
 
     files: list[str]
     starts: F64
@@ -210,7 +234,10 @@ class EpisodeTable:
 
 
 def read_episode_table(root: Path, info: Info) -> EpisodeTable:
-    """Read `meta/episodes`, without statistics. Raises `ManipError` naming a file that cannot be read."""
+    """Read `meta/episodes`, without statistics.
+
+    Raises `ManipError` naming a file that cannot be read.
+    """
     with reading(root / "meta/episodes"):
         table = _read_rows(root, lambda name: not name.startswith("stats/"))
 
@@ -226,7 +253,11 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
             ]
             return VideoSpans(paths, table.column(f"videos/{key}/from_timestamp").to_numpy())
 
-        tasks = table.column("tasks").to_pylist() if "tasks" in table.column_names else [None] * len(table)
+        tasks = (
+            table.column("tasks").to_pylist()
+            if "tasks" in table.column_names
+            else [None] * len(table)
+        )
         others = [name for name in table.column_names if not _EPISODE_COLUMNS.fullmatch(name)]
         return EpisodeTable(
             index=numbers(layout.EPISODE_INDEX),
@@ -243,7 +274,9 @@ def read_picture_statistics(root: Path, cameras: Sequence[str]) -> list[Statisti
     """Return the stored statistics of every episode's pictures, by camera column."""
     found: list[Statistics] = []
     columns = {f"stats/{key}/{name}": (key, name) for key in cameras for name in layout.STAT_NAMES}
-    for row in _read_rows(root, lambda name: name in columns or name == layout.EPISODE_INDEX).to_pylist():
+    for row in _read_rows(
+        root, lambda name: name in columns or name == layout.EPISODE_INDEX
+    ).to_pylist():
         own: Statistics = {}
         for column, (key, name) in columns.items():
             if row.get(column) is not None:

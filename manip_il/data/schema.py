@@ -35,14 +35,20 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")  # in the name of a robot
 
 
 def exact_rate(fps: float) -> Fraction:
-    """Return the fraction that a rate stands for, 2997/125 for 23.976; it fits the 32 bits of a video's time base."""
+    """Return the fraction that a rate stands for, 2997/125 for 23.976.
+
+    It fits the 32 bits of a video's time base.
+    """
     return Fraction(str(fps)).limit_denominator(100_000)
 
 
 def robot_of(robot_type: str) -> dict[str, str]:
     """Return the fields of `EnvironmentSpec` that LeRobot's `robot_type`, any text, determines."""
     if robot_type not in LEROBOT_TYPES:
-        return {"robot": _UNSAFE.sub("_", robot_type), "robot_type": robot_type if _UNSAFE.search(robot_type) else ""}
+        return {
+            "robot": _UNSAFE.sub("_", robot_type),
+            "robot_type": robot_type if _UNSAFE.search(robot_type) else "",
+        }
     return {"robot": LEROBOT_TYPES[robot_type], "robot_type": robot_type, "action_meaning": SERVOS}
 
 
@@ -50,7 +56,11 @@ def features(spec: EnvironmentSpec) -> dict[str, dict[str, Any]]:
     """Return LeRobot's feature table for our columns (LeRobot adds its own index columns)."""
     joints, pictured = list(spec.joint_names), "video" if spec.video else "image"
     points = [f"{name}.{what}" for name in spec.keypoints for what in ("across", "down", "in_view")]
-    pictures = {"dtype": pictured, "shape": (*spec.image_size, 3), "names": ["height", "width", "channels"]}
+    pictures = {
+        "dtype": pictured,
+        "shape": (*spec.image_size, 3),
+        "names": ["height", "width", "channels"],
+    }
     return {
         STATE: _feature("float32", joints),
         ENVIRONMENT_STATE: _feature("float32", spec.environment_state_names),
@@ -81,13 +91,16 @@ def check_same_spec(
 ) -> None:
     """Raise `MismatchError` unless actions and observations have the same meaning on both sides.
 
-    The task may differ, so that a policy can be tried on another task. left: a spec, or an object with the same fields.
-    also: other fields that must agree.
+    The task may differ, so that a policy can be tried on another task. left: a spec, or an object
+    with the same fields. also: other fields that must agree.
     """
     for what in (*MUST_AGREE, *also):
         ours, theirs = getattr(left, what), getattr(right, what)
         if ours != theirs:
-            if what == "environment_state_names":  # the list is long: show only the first difference
-                ours, theirs = next(pair for pair in zip_longest(ours, theirs) if pair[0] != pair[1])
+            # the list is long: show only the first difference
+            if what == "environment_state_names":
+                ours, theirs = next(
+                    pair for pair in zip_longest(ours, theirs) if pair[0] != pair[1]
+                )
             none = OWN_OBJECT if what == "object" else "none"
             raise MismatchError(what, left_name, ours or none, right_name, theirs or none)

@@ -1,8 +1,9 @@
 """Statistics of columns under LeRobot's names, in float64.
 
-Statistics of an episode are exact: a quantile is the value of rank ceil(q T), whereas LeRobot uses a histogram of
-5,000 bins. Statistics of a dataset are pooled from its episodes as in LeRobot: min, max, mean and std are exact, a
-quantile is the mean of the episodes' quantiles, weighted by their frames.
+Statistics of an episode are exact: a quantile is the value of rank ceil(q T), whereas LeRobot uses
+a histogram of 5,000 bins. Statistics of a dataset are pooled from its episodes as in LeRobot: min,
+max, mean and std are exact, a quantile is the mean of the episodes' quantiles, weighted by their
+frames.
 """
 
 import math
@@ -23,7 +24,8 @@ _LEVELS = np.arange(256)  # pixel values
 
 
 def column_statistics(columns: Mapping[str, NDArray[Any]]) -> Statistics:
-    """Return {column: {min, max, mean, std, count, q01, ...}} of numeric or boolean columns, (T,) or (T, d).
+    """Return {column: {min, max, mean, std, count, q01, ...}} of numeric or boolean columns, (T,)
+    or (T, d).
 
     Every statistic is (d,), except that `count` is (1,).
     """
@@ -45,7 +47,9 @@ def column_statistics(columns: Mapping[str, NDArray[Any]]) -> Statistics:
 
 
 def picture_statistics(frames: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-    """Return the statistics of pictures (T, height, width, 3): values in [0, 1], one per channel, (3, 1, 1)."""
+    """Return the statistics of pictures (T, height, width, 3): values in [0, 1], one per
+    channel, (3, 1, 1).
+    """
     counts = np.zeros(3 * len(_LEVELS), np.int64)
     for frame in frames:
         counts += Image.fromarray(frame).histogram()
@@ -59,7 +63,9 @@ def picture_statistics(frames: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         **{name: (below > place).argmax(axis=1) for name, place in places.items()},
     }
     shaped = {name: values.reshape(3, 1, 1) / 255 for name, values in levels.items()}
-    return {name: np.array([len(frames)]) if name == "count" else shaped[name] for name in STAT_NAMES}
+    return {
+        name: np.array([len(frames)]) if name == "count" else shaped[name] for name in STAT_NAMES
+    }
 
 
 def quantile_places(count: int) -> dict[str, int]:
@@ -68,17 +74,23 @@ def quantile_places(count: int) -> dict[str, int]:
 
 
 def pool(one: Statistics, other: Statistics) -> Statistics:
-    """Return the pooled statistics of the columns that two episodes or datasets share; quantiles may be missing.
+    """Return the pooled statistics of the columns that two episodes or datasets share.
+
+    Quantiles may be missing.
 
     Mean and std follow Chan et al. (1979), Updating formulae and a pairwise algorithm, eq. 2.1.
     """
     return {key: _pool(one[key], other[key]) for key in one if key in other}
 
 
-def _pool(old: Mapping[str, NDArray[Any]], new: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _pool(
+    old: Mapping[str, NDArray[Any]], new: Mapping[str, NDArray[Any]]
+) -> dict[str, NDArray[Any]]:
     count = old["count"] + new["count"]
     share, apart = new["count"] / count, new["mean"] - old["mean"]
-    spread = (1 - share) * old["std"] ** 2 + share * new["std"] ** 2 + share * (1 - share) * apart**2
+    spread = (
+        (1 - share) * old["std"] ** 2 + share * new["std"] ** 2 + share * (1 - share) * apart**2
+    )
     found = {"min": np.minimum(old["min"], new["min"]), "max": np.maximum(old["max"], new["max"])}
     found |= {"std": np.sqrt(spread), "count": count}
     means = [name for name in ("mean", *QUANTILES) if name in old and name in new]
@@ -88,15 +100,24 @@ def _pool(old: Mapping[str, NDArray[Any]], new: Mapping[str, NDArray[Any]]) -> d
 
 def to_lists(statistics: Statistics) -> dict[str, dict[str, list[Any]]]:
     """Return statistics as plain lists, as in `meta/stats.json`."""
-    return {key: {name: values.tolist() for name, values in table.items()} for key, table in statistics.items()}
+    return {
+        key: {name: values.tolist() for name, values in table.items()}
+        for key, table in statistics.items()
+    }
 
 
 def read_statistics(root: Path) -> Statistics:
-    """Read `meta/stats.json`; statistics of pictures are (channels, 1, 1). Raises `ManipError` if it is invalid."""
+    """Read `meta/stats.json`; statistics of pictures are (channels, 1, 1).
+
+    Raises `ManipError` if it is invalid.
+    """
     path = root / STATS
     with reading(path):
         found = checks.read_json(path, "a dataset's statistics")
         return {
-            key: {name: np.atleast_1d(np.asarray(values, np.float64)) for name, values in table.items()}
+            key: {
+                name: np.atleast_1d(np.asarray(values, np.float64))
+                for name, values in table.items()
+            }
             for key, table in found.items()
         }

@@ -1,7 +1,8 @@
 """Encode pictures with LeRobot's settings; every episode is appended to a file that stays open.
 
-LeRobot writes one file per episode and then copies all earlier episodes into a new file. Its settings are copied here
-(and tests compare the two), because importing `lerobot.configs.video` imports torch, which takes seconds.
+LeRobot writes one file per episode and then copies all earlier episodes into a new file. Its
+settings are copied here (and tests compare the two), because importing `lerobot.configs.video`
+imports torch, which takes seconds.
 """
 
 import itertools
@@ -30,7 +31,9 @@ _OPTIONS = {"movflags": "faststart", "fflags": "+bitexact"}
 
 
 class CameraFiles:
-    """Writes one camera's numbered video files, one at a time; the same episodes give the same bytes.
+    """Writes one camera's numbered video files, one at a time.
+
+    The same episodes give the same bytes.
 
     size: height and width of the written pictures [pixels]; None if films were only copied.
     """
@@ -50,7 +53,10 @@ class CameraFiles:
         self.size: tuple[int, int] | None = None
 
     def copy(self, episode: EpisodeData) -> dict[str, Any]:
-        """Copy the video file that holds an episode, unless already copied; return the columns of its row."""
+        """Copy the video file that holds an episode, unless already copied.
+
+        Return the columns of its row.
+        """
         film = episode.films[self._key]
         source = episode.dataset, film.path
         if episode.cut or source not in self._copied:
@@ -98,7 +104,9 @@ class CameraFiles:
             container.close()
 
     def info(self, size: tuple[int, int]) -> dict[str, Any]:
-        """Return the entry of LeRobot's `info.json` for this camera. size: height and width [pixels]."""
+        """Return the entry of LeRobot's `info.json` for this camera. size: height and width
+        [pixels].
+        """
         config = self._config
         return {
             "video.height": size[0],
@@ -118,7 +126,9 @@ class CameraFiles:
         }
 
     def _next_file(self) -> tuple[Path, dict[str, Any]]:
-        """Return the path of the open or the next file, and its numbers in columns of `meta/episodes`."""
+        """Return the path of the open or the next file, and its numbers in columns of
+        `meta/episodes`.
+        """
         name, chunk, file = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
         path = self._folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -141,7 +151,10 @@ class CameraFiles:
 
 
 def _cut(film: FrameRange, target: Path, fps: float) -> None:
-    """Copy frames of a video file as they are encoded. Raises `ManipError` if they need frames before them."""
+    """Copy frames of a video file as they are encoded.
+
+    Raises `ManipError` if they need frames before them.
+    """
     with (
         reading(film.path),
         closing(open_video(film.path)) as source,
@@ -160,7 +173,9 @@ def _cut(film: FrameRange, target: Path, fps: float) -> None:
         packets: list[Any] = [*itertools.islice(inside, film.count)]
         if len(packets) != film.count or not packets[0].is_keyframe:
             last = film.first + film.count - 1
-            raise ValueError(f"frames {film.first} to {last} cannot be cut out without encoding them again")
+            raise ValueError(
+                f"frames {film.first} to {last} cannot be cut out without encoding them again"
+            )
         start = packets[0].pts or 0
         for packet in packets:
             packet.pts = (packet.pts or 0) - start
@@ -172,8 +187,9 @@ def _cut(film: FrameRange, target: Path, fps: float) -> None:
 def _encode(encoder: Any, frame: av.VideoFrame | None) -> list[Any]:
     """Encode a frame, or None to flush; the first one opens the encoder.
 
-    If run by root, SVT-AV1 permanently gives real-time priority (SCHED_FIFO) to the calling thread and to its worker
-    threads, which with their child processes would starve all other processes. This undoes it.
+    If run by root, SVT-AV1 permanently gives real-time priority (SCHED_FIFO) to the calling thread
+    and to its worker threads, which with their child processes would starve all other processes.
+    This undoes it.
     """
     opens = not encoder.is_open
     packets = encoder.encode(frame)
@@ -210,4 +226,6 @@ def try_encoder(config: VideoConfig, size: tuple[int, int], fps: float) -> None:
         _encode(encoder, None)
     except (av.FFmpegError, ValueError) as error:
         expected = f"expected even sizes and settings of {config.vcodec}"
-        raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {config}: {error}; {expected}") from error
+        raise UsageError(
+            f"cannot encode {size[1]} x {size[0]} pictures with {config}: {error}; {expected}"
+        ) from error

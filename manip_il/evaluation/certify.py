@@ -1,14 +1,15 @@
-"""Measure the expert's recoverability: rollouts with one perturbation, compared with the same rollouts undisturbed.
+"""Measure the expert's recoverability: rollouts with one perturbation, compared with the same
+rollouts undisturbed.
 
-The cost of a state is the number of control steps until the task is solved. If Q*(s, a) is the expert's cost after
-action a in state s, and V*(s) its cost if it acts itself from s on, the gap Q*(s, a) - V*(s) is what action a costs.
-Expert and simulator are deterministic, so the undisturbed run of a seed gives V* of every state in it, and the same run
-with one wrong action gives Q*.
+The cost of a state is the number of control steps until the task is solved. If Q*(s, a) is the
+expert's cost after action a in state s, and V*(s) its cost if it acts itself from s on, the gap
+Q*(s, a) - V*(s) is what action a costs. Expert and simulator are deterministic, so the undisturbed
+run of a seed gives V* of every state in it, and the same run with one wrong action gives Q*.
 
-Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest gap, u: a learner that errs in a share e of
-the states it visits within T steps costs at most u T e more than the expert, so the cost is linear in T if mistakes can
-be undone, not quadratic. Rajaraman et al. (2021) call this mu-recoverability. The largest gap among sampled actions, as
-here, is a lower bound of u.
+Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest gap, u: a learner that
+errs in a share e of the states it visits within T steps costs at most u T e more than the expert,
+so the cost is linear in T if mistakes can be undone, not quadratic. Rajaraman et al. (2021) call
+this mu-recoverability. The largest gap among sampled actions, as here, is a lower bound of u.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -39,8 +40,8 @@ Group = Literal["start", "state", "action"]
 class Case(NamedTuple):
     """One episode. moment: the control step from which the expert is judged.
 
-    steps: control steps from the moment until the task is solved; None if not solved within the horizon. undisturbed:
-    the same without the perturbation, if known.
+    steps: control steps from the moment until the task is solved; None if not solved within the
+    horizon. undisturbed: the same without the perturbation, if known.
     """
 
     seed: int
@@ -53,8 +54,8 @@ class Case(NamedTuple):
 class Row:
     """The cases of one kind. kind, words: its short and full name; horizon: [control steps].
 
-    left_out: number of episodes without a case, because the undisturbed run failed, or the perturbation could not be
-    placed or changed nothing.
+    left_out: number of episodes without a case, because the undisturbed run failed, or the
+    perturbation could not be placed or changed nothing.
     """
 
     group: Group
@@ -67,19 +68,29 @@ class Row:
     @property
     def success(self) -> Proportion | None:
         """Share of cases solved within a horizon from their moment; None if there are no cases."""
-        return Proportion.of([case.steps is not None for case in self.cases]) if self.cases else None
+        return (
+            Proportion.of([case.steps is not None for case in self.cases]) if self.cases else None
+        )
 
     @property
     def gaps(self) -> list[int]:
-        """Q*(s, a) - V*(s) of each wrong action [control steps]; the whole horizon if the expert did not recover."""
+        """Q*(s, a) - V*(s) of each wrong action [control steps].
+
+        The whole horizon if the expert did not recover.
+        """
         known = [case for case in self.cases if case.undisturbed is not None]
-        return [self.horizon if case.steps is None else case.steps - (case.undisturbed or 0) for case in known]
+        return [
+            self.horizon if case.steps is None else case.steps - (case.undisturbed or 0)
+            for case in known
+        ]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; a case is [seed, moment, steps, undisturbed]."""
         found = {"group": self.group, "kind": self.kind, "words": self.words}
         found |= {"n": len(self.cases), "left_out": self.left_out}
-        found |= self.success.to_json() if self.success else {"success_rate": None, "interval": None}
+        found |= (
+            self.success.to_json() if self.success else {"success_rate": None, "interval": None}
+        )
         return found | {"cases": [list(case) for case in self.cases]}
 
 
@@ -87,7 +98,8 @@ class Row:
 class Certificate:
     """Recoverability of the expert on one robot and task, one row per kind of perturbation.
 
-    settings: cases (per kind), seed, horizon [control steps], control_hz, tolerance [m] and success_steps.
+    settings: cases (per kind), seed, horizon [control steps], control_hz, tolerance [m] and
+    success_steps.
     """
 
     robot: str
@@ -102,7 +114,9 @@ class Certificate:
 
     @property
     def mu(self) -> int | None:
-        """The largest gap over all wrong actions [control steps]: the empirical u of Ross et al. (2011)."""
+        """The largest gap over all wrong actions [control steps]: the empirical u of Ross et al.
+        (2011).
+        """
         return max((gap for row in self.of("action") for gap in row.gaps), default=None)
 
     def to_json(self) -> dict[str, Any]:
@@ -111,18 +125,25 @@ class Certificate:
         return vars(self) | {"confidence": CONFIDENCE, "mu": self.mu, "rows": rows}
 
     def table(self) -> Table:
-        """Return one row per kind of perturbation: how often the expert recovers, and what a wrong action costs."""
+        """Return one row per kind of perturbation: how often the expert recovers, and what a
+        wrong action costs.
+        """
         rows: list[tuple[str, ...]] = []
         for row in self.rows:
             gaps = row.gaps if row.group == "action" else []
             costs = (f"{np.mean(gaps):.1f}", str(max(gaps))) if gaps else ("", "")
-            rows.append((row.words, str(row.success or ""), *costs, str(len(row.cases)), str(row.left_out)))
+            rows.append(
+                (row.words, str(row.success or ""), *costs, str(len(row.cases)), str(row.left_out))
+            )
         head = ("the expert continues from", f"solved {INTERVAL}", "mean cost", "largest cost")
         return Table((*head, "cases", "left out"), tuple(rows))
 
 
 def count_episodes(env: EnvConfig, cases: int) -> int:
-    """Return the largest number of episodes that `certify` runs. Raises `Unable` if its states cannot be perturbed."""
+    """Return the largest number of episodes that `certify` runs.
+
+    Raises `Unable` if its states cannot be perturbed.
+    """
     env_spec(env).require("perturbed", "choose another robot")
     return cases * (2 + len(kinds_for(get_task(env.task))))
 
@@ -134,10 +155,12 @@ def certify(
     seed: int = 0,
     on_episode: Callable[[Episode], object] = lambda _: None,
 ) -> Certificate:
-    """Measure the expert on `env` with `cases` episodes per kind of perturbation, on seeds of the stream `certificate`.
+    """Measure the expert on `env` with `cases` episodes per kind of perturbation, on seeds of the
+    stream `certificate`.
 
-    The step of a perturbation is drawn uniformly from those that the undisturbed run takes until the task is solved;
-    from that step on, the expert has a whole horizon to solve it. on_episode: called with every episode as it ends.
+    The step of a perturbation is drawn uniformly from those that the undisturbed run takes until
+    the task is solved; from that step on, the expert has a whole horizon to solve it. on_episode:
+    called with every episode as it ends.
     """
     seeds = stream_seeds("certificate", cases, seed)
     rows: list[Row] = []
@@ -157,8 +180,8 @@ def certify(
     solved = {case.seed: case.steps for case in starts if case.steps is not None}
     if not solved:
         raise ManipError(
-            f"the expert solved none of {len(seeds)} undisturbed episodes within {env.horizon} steps, so there is "
-            "nothing to perturb; give it a longer --env.horizon"
+            f"the expert solved none of {len(seeds)} undisturbed episodes within {env.horizon}"
+            " steps, so there is nothing to perturb; give it a longer --env.horizon"
         )
     for kind, known in kinds_for(get_task(env.task)).items():
         moments = {seed: draw_moment(seed, kind, steps) for seed, steps in solved.items()}
@@ -192,4 +215,6 @@ def _case(episode: Episode, moment: int, horizon: int, undisturbed: int | None =
 def _differ(one: Episode, other: Episode, step: int) -> bool:
     """Return whether the state or the executed action of a step differs between two episodes."""
     names = (schema.SIM_STATE, schema.EXECUTED_ACTION)
-    return not all(np.array_equal(one.columns[name][step], other.columns[name][step]) for name in names)
+    return not all(
+        np.array_equal(one.columns[name][step], other.columns[name][step]) for name in names
+    )

@@ -28,10 +28,12 @@ FILE_NAME = "compare.json"
 
 @dataclass(frozen=True)
 class Comparison:
-    """`right` against `left`, paired by training seed and by test episode. Differences are right minus left.
+    """`right` against `left`, paired by training seed and by test episode.
 
-    Episodes that only one side ran do not count. Raises `MismatchError` if robot, task or settings differ, `ManipError`
-    if left and right share no episode.
+    Differences are right minus left.
+
+    Episodes that only one side ran do not count. Raises `MismatchError` if robot, task or settings
+    differ, `ManipError` if left and right share no episode.
     """
 
     left: Side
@@ -42,7 +44,8 @@ class Comparison:
             require_comparable(self.left.name, one, self.right.name, other)
         if not all(self._outcomes):
             raise ManipError(
-                f"{self.left.name} and {self.right.name} share no seed; evaluate both with the same --seed="
+                f"{self.left.name} and {self.right.name} share no seed; evaluate both with the same"
+                " --seed="
             )
 
     @cached_property
@@ -67,14 +70,18 @@ class Comparison:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """(low, high) of `difference`: Newcombe's interval for one training seed, Student's for two or more."""
+        """(low, high) of `difference`: Newcombe's interval for one training seed, Student's for
+        two or more.
+        """
         if len(self.pairs) == 1:
             return self.pairs[0].interval
         return mean_interval([pair.difference for pair in self.pairs])
 
     @cached_property
     def p_value(self) -> float:
-        """Exact two-sided p of `sign_flip_exact` over test episodes; for one training seed, of McNemar's test.
+        """Exact two-sided p of `sign_flip_exact` over test episodes.
+
+        For one training seed, of McNemar's test.
 
         It holds for these trained policies; `interval` also covers other training seeds.
         """
@@ -85,20 +92,27 @@ class Comparison:
 
     @property
     def significant(self) -> bool:
-        """Whether one side is better by the exact test and, with several training seeds, also by the t interval."""
+        """Whether one side is better by the exact test and, with several training seeds, also by
+        the t interval.
+        """
         low, high = self.interval
         return self.p_value < 1 - CONFIDENCE and (len(self.pairs) == 1 or low > 0 or high < 0)
 
     @property
     def verdict(self) -> str:
-        """A sentence: which side is better, or that neither is shown to be better, with difference, interval and p."""
+        """A sentence: which side is better, or that neither is shown to be better, with
+        difference, interval and p.
+        """
         n, sign = len(self.pairs), -1 if self.difference < 0 else 1
         leads = sum(sign * pair.difference > 0 for pair in self.pairs)
         tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes"
         tested += f" on each of {n} training seeds, ahead in {leads}" if n > 1 else ""
         if not self.significant:
             points = format_points(self.difference, self.interval)
-            return f"No difference shown between {self.right.name} and {self.left.name}: {points}, {tested}."
+            return (
+                f"No difference shown between {self.right.name} and {self.left.name}: {points},"
+                f" {tested}."
+            )
         better, worse = (self.left, self.right) if sign < 0 else (self.right, self.left)
         low, high = sorted(100 * sign * end for end in self.interval)
         points = f"{100 * abs(self.difference):.1f} points [{low:.1f}, {high:.1f}]"
@@ -125,10 +139,11 @@ class Comparison:
 class Study:
     """Tested sides with the same training seeds, and what they cost.
 
-    baseline: the side that the others are compared with; None for sides of different tasks. rule: how each run's round
-    was chosen. target: validation success for which the cost is reported.
+    baseline: the side that the others are compared with; None for sides of different tasks. rule:
+    how each run's round was chosen. target: validation success for which the cost is reported.
 
-    Raises what `Comparison` raises, and `ManipError` unless all sides of a comparison ran the same episodes.
+    Raises what `Comparison` raises, and `ManipError` unless all sides of a comparison ran the same
+    episodes.
     """
 
     sides: tuple[Side, ...]
@@ -138,67 +153,92 @@ class Study:
 
     def __post_init__(self) -> None:
         for one in self.comparisons.values():
-            ran = {frozenset(episode.seed for episode in it.episodes) for it in one.left.results + one.right.results}
+            ran = {
+                frozenset(episode.seed for episode in it.episodes)
+                for it in one.left.results + one.right.results
+            }
             if len(ran) > 1:
                 raise ManipError(
-                    f"test episodes of {one.left.name} and {one.right.name} differ; evaluate both with the same --seed "
-                    "and --eval.n_episodes"
+                    f"test episodes of {one.left.name} and {one.right.name} differ; evaluate both"
+                    " with the same --seed and --eval.n_episodes"
                 )
 
     @cached_property
     def comparisons(self) -> dict[str, Comparison]:
-        """Side -> its comparison with the baseline, for every other side; empty without a baseline."""
+        """Side -> its comparison with the baseline, for every other side.
+
+        Empty without a baseline.
+        """
         if self.baseline is None:
             return {}
         baseline = next(side for side in self.sides if side.name == self.baseline)
-        return {side.name: Comparison(baseline, side) for side in self.sides if side is not baseline}
+        return {
+            side.name: Comparison(baseline, side) for side in self.sides if side is not baseline
+        }
 
     @property
     def verdict(self) -> str:
-        """The first sentence: the better of two sides, or how well each of several does, the best one first."""
+        """The first sentence: the better of two sides, or how well each of several does, the
+        best one first.
+        """
         if len(self.comparisons) == 1:
             return next(iter(self.comparisons.values())).verdict
         best, *others = sorted(self.sides, key=lambda side: -side.rate)
         n, seeds = best.results[0].success.n, len(best.members)
         over = f", the mean of {seeds} training seeds" if seeds > 1 else ""
         rates = ", ".join(f"{side.name} {format_percent(side.rate)}" for side in others)
-        return f"{best.name} solves {format_percent(best.rate)} of {n:,} unseen starts{over}; {rates}."
+        return (
+            f"{best.name} solves {format_percent(best.rate)} of {n:,} unseen starts{over}; {rates}."
+        )
 
     @property
     def facts(self) -> list[str]:
-        """Return the sentences after the verdict: comparisons with the baseline, and how rounds were chosen."""
+        """Return the sentences after the verdict: comparisons with the baseline, and how rounds
+        were chosen.
+        """
         verdicts = [comparison.verdict for comparison in self.comparisons.values()]
         facts = verdicts if len(verdicts) > 1 else []
         if self.comparisons and len(self.sides[0].members) > 1:
-            facts.append("Intervals are Student's over training seeds; p is exact and holds for these policies alone.")
+            facts.append(
+                "Intervals are Student's over training seeds; p is exact and holds for these"
+                " policies alone."
+            )
         if any(member.chosen for side in self.sides for member in side.members):
             facts.append(self.rule.fact)
         return facts
 
     def table(self) -> Table:
-        """Return one row per side: mean costs, validation, test success, difference, cost to the target on validation.
+        """Return one row per side: mean costs, validation, test success, difference, cost to the
+        target on validation.
 
         Brackets hold the values of each training seed or, for a single seed, the interval.
         """
         rows: list[tuple[str, ...]] = []
         costs = costs_of(member.history for side in self.sides for member in side.members)
         for side in self.sides:
-            against, chosen = self.comparisons.get(side.name), [one.chosen for one in side.members if one.chosen]
+            against = self.comparisons.get(side.name)
+            chosen = [member.chosen for member in side.members if member.chosen]
             cells = [_mean_cost(cost, chosen) if chosen else "" for cost in costs]
             cells.append(_rates([one.validation for one in chosen]) if chosen else "")
             cells.append(_rates([result.success for result in side.results]))
-            points = against and f"{format_points(against.difference, against.interval)}, {format_p(against.p_value)}"
+            points = ""
+            if against:
+                difference = format_points(against.difference, against.interval)
+                points = f"{difference}, {format_p(against.p_value)}"
             reached = "not reached" if side.histories else ""
             if None not in (first := self._reached(side)):
                 reached = _mean_cost(costs[0], first)
-            rows.append((side.name, *cells, points or "", reached))
+            rows.append((side.name, *cells, points, reached))
         head = ("side", *costs, "validation", "test", f"test, against {self.baseline}")
         return Table((*head, f"{costs[0]} to {100 * self.target:g} %"), tuple(rows))
 
     def _reached(self, side: Side) -> list[Round | None]:
-        """Return, for each training seed, the round in which validation first reached the target."""
+        """Return, for each training seed, the round in which validation first reached the
+        target.
+        """
         return [
-            next((one for one in member.history if one.validation.rate >= self.target), None) for member in side.members
+            next((one for one in member.history if one.validation.rate >= self.target), None)
+            for member in side.members
         ]
 
     def to_json(self) -> dict[str, Any]:
@@ -210,7 +250,11 @@ class Study:
             "facts": self.facts,
             "baseline": self.baseline,
             "target": self.target,
-            "rule": {"checkpoint": self.rule.checkpoint, "at": self.rule.at, "limit": self.rule.limit},
+            "rule": {
+                "checkpoint": self.rule.checkpoint,
+                "at": self.rule.at,
+                "limit": self.rule.limit,
+            },
             "arms": {side.name: self._side_json(side) for side in self.sides},
             "robot": result.robot,
             "test_seeds": [min(seeds), max(seeds)],
@@ -238,4 +282,7 @@ def _mean_cost(cost: Cost, rounds: Sequence[Round | None]) -> str:
 def _rates(found: Sequence[Proportion]) -> str:
     if len(found) == 1:
         return str(found[0])
-    return f"{format_percent(fmean(one.rate for one in found))} ({', '.join(f'{100 * one.rate:.1f}' for one in found)})"
+    return (
+        f"{format_percent(fmean(one.rate for one in found))}"
+        f" ({', '.join(f'{100 * one.rate:.1f}' for one in found)})"
+    )

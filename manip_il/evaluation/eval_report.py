@@ -1,4 +1,6 @@
-"""`report.html` of an evaluation, a run's policies or a comparison: success, failures, costs and films."""
+"""`report.html` of an evaluation, a run's policies or a comparison: success, failures, costs and
+films.
+"""
 
 import itertools
 from collections import Counter
@@ -22,11 +24,20 @@ def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = 
     end = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
     note = f"Episodes have at most {settings.horizon:,} control steps. Success: {solved}{end}."
     if result.until_width is not None:
-        note += " Intervals are from a confidence sequence, which is valid whenever the evaluation stops."
-    verdict = f"{result.policy} succeeds in {success} of {success.n:,} unseen episodes of {result.robot} {result.task}"
+        note += (
+            " Intervals are from a confidence sequence, which is valid whenever the evaluation"
+            " stops."
+        )
+    verdict = (
+        f"{result.policy} succeeds in {success} of {success.n:,} unseen episodes of {result.robot}"
+        f" {result.task}"
+    )
     phase, count = next(iter(result.failures.items()), ("", 0))
     if phase:  # else nothing failed, or the task has no phases
-        verdict += f"; {count:,} of its {success.n - success.successes:,} failures end in the phase {phase}"
+        verdict += (
+            f"; {count:,} of its {success.n - success.successes:,} failures end in the phase"
+            f" {phase}"
+        )
     return run_report(
         condition_sides(result),
         films=films,
@@ -44,7 +55,10 @@ def compare_report(study: Study, title: str) -> Report:
     colours = dict(zip(others, itertools.cycle(COLOURS), strict=False))
     sides = [replace(side, colour=colours.get(side.name, BASELINE)) for side in study.sides]
     first = sides[0].results[0]
-    note = f"Every policy ran {first.success.n:,} test episodes on the same seeds, which selected no policy."
+    note = (
+        f"Every policy ran {first.success.n:,} test episodes on the same seeds, which selected no"
+        " policy."
+    )
     if len(sides[0].members) > 1:
         note += " In brackets: each training seed."
     what = first.robot if study.baseline is None else f"{first.robot} {first.task}"
@@ -91,15 +105,23 @@ def run_report(
         note = f"{note} Conditions: {tested.settings.disturbance}.".lstrip()
     table = table or success_table(sides)
     sections = [Section("Results", tables=(table,), notes=(note,))]
-    counted = [sum((Counter(result.failures) for result in side.results), Counter[str]()) for side in failed]
+    counted = [
+        sum((Counter(result.failures) for result in side.results), Counter[str]())
+        for side in failed
+    ]
     phases = [phase for phase, _ in sum(counted, Counter[str]()).most_common() if phase]
     if phases:
         rows = tuple((phase, *(f"{counts[phase]:,}" for counts in counted)) for phase in phases)
         failures = Table(("phase that it ended in", *(side.name for side in failed)), rows)
         sections.append(Section("Where they fail", tables=(failures,)))
     if runs:
-        words = "Validation success by round of each run. Seconds are of collecting and fitting, without validating."
-        sections.append(Section("Success against cost", figures=curve_figures(runs, target), notes=(words,)))
+        words = (
+            "Validation success by round of each run. Seconds are of collecting and fitting,"
+            " without validating."
+        )
+        sections.append(
+            Section("Success against cost", figures=curve_figures(runs, target), notes=(words,))
+        )
     if films or no_films:
         lead = (f"No films: {no_films}",) if no_films else ()
         sections.append(Section("How it looks", lead, films=tuple(films)))
@@ -108,7 +130,9 @@ def run_report(
 
 
 def condition_sides(result: EvalResult) -> list[Side]:
-    """Return an evaluation as the sides of a report: all episodes and, if there are several, each condition's."""
+    """Return an evaluation as the sides of a report: all episodes and, if there are several,
+    each condition's.
+    """
     conditions = result.by_condition
     if len(conditions) < 2:
         return [Side.of(result.policy, result)]
@@ -119,7 +143,8 @@ def condition_sides(result: EvalResult) -> list[Side]:
 def success_table(sides: Sequence[Side]) -> Table:
     """Return one row per policy or condition, given sides of one evaluation each.
 
-    Columns: episodes, expert labels, success, success at the end, control steps to success, success when disturbed.
+    Columns: episodes, expert labels, success, success at the end, control steps to success, success
+    when disturbed.
     """
     rows: list[tuple[str, ...]] = []
     for side in sides:
@@ -135,5 +160,12 @@ def success_table(sides: Sequence[Side]) -> Table:
                 str(side.disturbed.success) if side.disturbed else "",
             )
         )
-    head = ("", "episodes", "expert labels", f"success {INTERVAL}", "success at end", "steps to success")
+    head = (
+        "",
+        "episodes",
+        "expert labels",
+        f"success {INTERVAL}",
+        "success at end",
+        "steps to success",
+    )
     return Table((*head, "success, disturbed"), tuple(rows), tuple(side.colour for side in sides))

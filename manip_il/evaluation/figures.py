@@ -1,6 +1,7 @@
 """Figures of reports, drawn by matplotlib as SVG: learning curves.
 
-A panel is as wide as a phone's screen, so that its text stays readable there; wide windows show panels side by side.
+A panel is as wide as a phone's screen, so that its text stays readable there; wide windows show
+panels side by side.
 """
 
 import io
@@ -37,7 +38,10 @@ _STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture in a report. svg: the file's content; words: alternative text; width: natural width [px]."""
+    """A picture in a report. svg: the file's content; words: alternative text.
+
+    width: natural width [px].
+    """
 
     svg: bytes
     words: str
@@ -45,7 +49,9 @@ class Figure:
 
 
 @contextmanager
-def drawing(columns: int, rows: int = 1, *, size: tuple[float, float], **options: Any) -> Iterator[tuple[Any, Any]]:
+def drawing(
+    columns: int, rows: int = 1, *, size: tuple[float, float], **options: Any
+) -> Iterator[tuple[Any, Any]]:
     """Yield a figure and its axes (rows, columns) in the reports' style.
 
     size: size of one panel [inches]. options: of matplotlib's `Figure.subplots`.
@@ -78,11 +84,27 @@ def curve_figures(sides: Sequence[Side], target: float | None = None) -> tuple[F
                 label = printable(textwrap.shorten(side.name, 40)).replace("$", r"\$")
                 for run in side.histories:
                     rates = [100 * one.validation.rate for one in run]
-                    axis.plot([one.amount(cost) for one in run], rates, _MARKERS[place % 4], c=side.colour, label=label)
+                    axis.plot(
+                        [one.amount(cost) for one in run],
+                        rates,
+                        _MARKERS[place % 4],
+                        c=side.colour,
+                        label=label,
+                    )
                     label = ""  # one entry per side in the legend
             if target is not None:
-                axis.axhline(100 * target, color=INK, ls="--", lw=1, label=f"target, {format_percent(target)}")
+                axis.axhline(
+                    100 * target,
+                    color=INK,
+                    ls="--",
+                    lw=1,
+                    label=f"target, {format_percent(target)}",
+                )
             axis.set(xlabel=cost, ylim=(-2, 102), ylabel="validation success [%]")
             drawn.legend(loc="outside upper left", ncols=2)
-            figures.append(to_figure(drawn, f"Validation success over {cost}: {', '.join(one.name for one in sides)}"))
+            figures.append(
+                to_figure(
+                    drawn, f"Validation success over {cost}: {', '.join(one.name for one in sides)}"
+                )
+            )
     return tuple(figures)

@@ -29,7 +29,9 @@ _LOG = logging.getLogger(__name__)
 
 
 def run_states(job: RolloutJob, seed: int) -> Episode:
-    """Return the episode of one seed with its states, identical to that in an evaluation of `job`."""
+    """Return the episode of one seed with its states, identical to that in an evaluation of
+    `job`.
+    """
     return next(replace(job, label="last").run([seed]))
 
 
@@ -45,7 +47,10 @@ def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str
 
 
 def collect_films(made: Iterable[Film], progress: Progress) -> tuple[list[Film], str]:
-    """Return the films and ""; without off-screen OpenGL, [] and the reason, which is also logged."""
+    """Return the films and "".
+
+    Without off-screen OpenGL, [] and the reason, which is also logged.
+    """
     films: list[Film] = []
     try:
         for film in made:
@@ -66,7 +71,11 @@ def film_outcomes(
 
     most: 0 for no films. Returns what `collect_films` does.
     """
-    shown = [one for good in (False, True) for one in [e for e in result.episodes if e.success == good][:most]]
+    shown = [
+        one
+        for good in (False, True)
+        for one in [e for e in result.episodes if e.success == good][:most]
+    ]
     if not shown:
         return [], ""
     progress.start("films", len(shown))
@@ -90,10 +99,16 @@ def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: float) -> bytes:
     """
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=schema.exact_rate(fps), options={"crf": "24", "preset": "medium"})
+        stream = container.add_stream(
+            "libx264", rate=schema.exact_rate(fps), options={"crf": "24", "preset": "medium"}
+        )
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = "yuv420p"
         for picture in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+            container.mux(
+                stream.encode(
+                    av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+                )
+            )
         container.mux(stream.encode())
     return buffer.getvalue()

@@ -1,4 +1,6 @@
-"""Confidence intervals and exact tests of success: one rate, two policies on the same seeds, several training seeds."""
+"""Confidence intervals and exact tests of success: one rate, two policies on the same seeds,
+several training seeds.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ _EDGE = 1e-12  # smallest distance from 0 and 1 at which a rate's likelihood is 
 class Proportion:
     """`successes` of `n` trials with Wilson's interval; prints as `98.7 % [97.8, 99.3]`.
 
-    sequential: whether `n` depended on the outcomes so far, so that the interval is that of a confidence sequence.
+    sequential: whether `n` depended on the outcomes so far, so that the interval is that of a
+    confidence sequence.
     """
 
     successes: int
@@ -30,7 +33,10 @@ class Proportion:
 
     def __post_init__(self) -> None:
         if self.n < 1 or not 0 <= self.successes <= self.n:
-            raise UsageError(f"{self.successes} successes of {self.n} trials; expected 0 <= successes <= n and n >= 1")
+            raise UsageError(
+                f"{self.successes} successes of {self.n} trials; expected 0 <= successes <= n and n"
+                " >= 1"
+            )
 
     @classmethod
     def of(cls, outcomes: Sequence[bool], sequential: bool = False) -> Proportion:
@@ -62,22 +68,33 @@ def format_percent(rate: float) -> str:
 
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
-    """Return the score interval (low, high) of a binomial proportion (Wilson 1927, J. Am. Stat. Assoc. 22, 209-212)."""
+    """Return the score interval (low, high) of a binomial proportion (Wilson 1927, J. Am. Stat.
+
+    Assoc. 22, 209-212).
+    """
     found = stats.binomtest(successes, n).proportion_ci(CONFIDENCE, method="wilson")
     # At the ends the formula gives the rate itself, up to rounding.
-    return (0.0 if successes == 0 else float(found.low)), (1.0 if successes == n else float(found.high))
+    return (0.0 if successes == 0 else float(found.low)), (
+        1.0 if successes == n else float(found.high)
+    )
 
 
 def confidence_sequence(successes: int, n: int) -> tuple[float, float]:
-    """Return (low, high) of a binomial proportion, valid at every `n` at once, whatever the stopping rule.
+    """Return (low, high) of a binomial proportion, valid at every `n` at once, whatever the
+    stopping rule.
 
-    A rate p is excluded once the likelihood of the outcomes, averaged over rates drawn from Beta(1/2, 1/2), is
-    1 / (1 - confidence) times that of p: under the true rate this ratio is a martingale of mean 1, so with probability
-    `CONFIDENCE` it never exceeds that factor (Ville 1939; Robbins 1970, Ann. Math. Stat. 41, 1397-1409). The interval
-    is wider than Wilson's, which is valid for an `n` fixed in advance.
+    A rate p is excluded once the likelihood of the outcomes, averaged over rates drawn from
+    Beta(1/2, 1/2), is 1 / (1 - confidence) times that of p: under the true rate this ratio is a
+    martingale of mean 1, so with probability `CONFIDENCE` it never exceeds that factor (Ville 1939;
+    Robbins 1970, Ann. Math. Stat. 41, 1397-1409). The interval is wider than Wilson's, which is
+    valid for an `n` fixed in advance.
     """
     failures = n - successes
-    mixture = special.betaln(successes + 0.5, failures + 0.5) - special.betaln(0.5, 0.5) + math.log1p(-CONFIDENCE)
+    mixture = (
+        special.betaln(successes + 0.5, failures + 0.5)
+        - special.betaln(0.5, 0.5)
+        + math.log1p(-CONFIDENCE)
+    )
 
     def excess(p: float) -> float:
         return float(mixture - special.xlogy(successes, p) - special.xlog1py(failures, -p))
@@ -87,14 +104,16 @@ def confidence_sequence(successes: int, n: int) -> tuple[float, float]:
         return found
 
     rate = min(max(successes / n, _EDGE), 1 - _EDGE)
-    return (0.0 if successes == 0 else edge(1e-300, rate)), (1.0 if failures == 0 else edge(rate, 1 - 1e-16))
+    return (0.0 if successes == 0 else edge(1e-300, rate)), (
+        1.0 if failures == 0 else edge(rate, 1 - 1e-16)
+    )
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:
     """Return Student's (low, high) for the mean of two or more independent `values`.
 
-    Student (1908), Biometrika 6, 1-25. It is wide for two or three values: the factor on the standard error is 12.7
-    or 4.3, compared with 2.0 for many values.
+    Student (1908), Biometrika 6, 1-25. It is wide for two or three values: the factor on the
+    standard error is 12.7 or 4.3, compared with 2.0 for many values.
     """
     half = float(stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * stats.sem(values))
     mean = float(np.mean(values))
@@ -130,8 +149,9 @@ class PairCounts:
     def interval(self) -> tuple[float, float]:
         """(low, high) of `difference`, inside [-1, 1].
 
-        Newcombe (1998), Statistics in Medicine 17, 2635-2650, method 10: combines the distances of Wilson's limits
-        from both rates, allowing for the continuity-corrected correlation of the outcomes.
+        Newcombe (1998), Statistics in Medicine 17, 2635-2650, method 10: combines the distances of
+        Wilson's limits from both rates, allowing for the continuity-corrected correlation of the
+        outcomes.
         """
         n = self.n
         right = self.both + self.only_right
@@ -152,20 +172,25 @@ class PairCounts:
 
 
 def sign_flip_exact(differences: Sequence[int]) -> float:
-    """Return the two-sided p of the hypothesis that both signs of each test episode's difference are equally likely.
+    """Return the two-sided p of the hypothesis that both signs of each test episode's difference
+    are equally likely.
 
-    differences: right's successes minus left's in an episode, summed over training seeds. Since the sign of this sum is
-    flipped, outcomes of different training seeds in one episode need not be independent. With one training seed this is
-    McNemar's exact test; in general it is Fisher's randomisation test (The Design of Experiments, 1935, section 21).
+    differences: right's successes minus left's in an episode, summed over training seeds. Since the
+    sign of this sum is flipped, outcomes of different training seeds in one episode need not be
+    independent. With one training seed this is McNemar's exact test; in general it is Fisher's
+    randomisation test (The Design of Experiments, 1935, section 21).
     """
-    ways = np.array([1], dtype=object)  # counts of the sums -total, -total + 2, ..., total of signed differences
+    # counts of the sums -total, -total + 2, ..., total of signed differences
+    ways = np.array([1], dtype=object)
     for size, count in Counter(abs(d) for d in differences if d).items():
         flips = np.zeros(size * count + 1, dtype=object)
         flips[::size] = [math.comb(count, k) for k in range(count + 1)]
         ways = np.convolve(ways, flips)
     total, observed = len(ways) - 1, abs(sum(differences))
     # Integers are divided only once, so the result is exact for any count.
-    return sum(count for place, count in enumerate(ways) if abs(2 * place - total) >= observed) / sum(ways)
+    return sum(
+        count for place, count in enumerate(ways) if abs(2 * place - total) >= observed
+    ) / sum(ways)
 
 
 def format_p(p: float) -> str:

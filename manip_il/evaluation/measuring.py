@@ -18,7 +18,13 @@ from manip_il.evaluation.eval_report import eval_report
 from manip_il.evaluation.film import film_outcomes, run_states
 from manip_il.evaluation.report import REPORT_FILE
 from manip_il.evaluation.results import EpisodeResult, EvalResult, require_equal
-from manip_il.evaluation.runner import FOLDER, episode_hold, episode_result, measure, replay_differences
+from manip_il.evaluation.runner import (
+    FOLDER,
+    episode_hold,
+    episode_result,
+    measure,
+    replay_differences,
+)
 from manip_il.evaluation.runner import evaluate as run_episodes
 from manip_il.evaluation.side import Side
 from manip_il.evaluation.suites import suite_conditions
@@ -63,10 +69,12 @@ def evaluate(
 
     Args:
         policy: A `Checkpoint`, or the path of a checkpoint or a run.
-        env: The environment, its name, or those of its settings that differ from the policy's training environment.
+        env: The environment, its name, or those of its settings that differ from the policy's
+            training environment.
         episodes: Number of episodes, by default 100; at most 10,000 with `until_width`.
         kind: Who drives without a policy: expert or random.
-        suite: Test conditions, by default nominal; or only their name, if `conditions` is among the options.
+        suite: Test conditions, by default nominal; or only their name, if `conditions` is among the
+            options.
         stream: Which stream of seeds.
         first: Index of the first seed in the stream.
         seed: 0 to 1000.
@@ -104,8 +112,12 @@ def evaluate(
         name = kind if policy is None else str(getattr(policy, "path", policy))
         progress.started()
         if output_dir is None:
-            return run_episodes(engine, job, seeds, name, progress.episode, suite=suite, until_width=until_width)
-        result = measure(engine, job, seeds, name, output_dir, progress, suite=suite, until_width=until_width)
+            return run_episodes(
+                engine, job, seeds, name, progress.episode, suite=suite, until_width=until_width
+            )
+        result = measure(
+            engine, job, seeds, name, output_dir, progress, suite=suite, until_width=until_width
+        )
         made = film_outcomes(engine, job, result, films, progress)
     if about is not None:
         replace(eval_report(result, *made), **about).write(output_dir / REPORT_FILE)
@@ -124,7 +136,9 @@ def measure_sides(
     engine: Engine,
     progress: Progress,
 ) -> tuple[Side, ...]:
-    """Evaluate the policies of a comparison on the same seeds; finished episodes in the folder are not run again.
+    """Evaluate the policies of a comparison on the same seeds.
+
+    Finished episodes in the folder are not run again.
 
     Args:
         sides: The sides; their members have policies.
@@ -154,10 +168,13 @@ def measure_sides(
         job = RolloutJob(env, driver, episode_hold(env), label="last", conditions=conditions)
         digest = job.policy.sha256[:8] if job.policy else driver.name
         words = f"{re.sub(r'[^A-Za-z0-9]+', '_', member.name)[-80:]}_{digest}"
-        results.append(measure(engine, job, seeds, member.name, folder / FOLDER / words, progress, suite=suite))
+        results.append(
+            measure(engine, job, seeds, member.name, folder / FOLDER / words, progress, suite=suite)
+        )
     found = iter(results)
     return tuple(
-        replace(side, members=tuple(replace(member, result=next(found)) for member in side.members)) for side in sides
+        replace(side, members=tuple(replace(member, result=next(found)) for member in side.members))
+        for side in sides
     )
 
 
@@ -170,11 +187,17 @@ def open_driver(
     """
     checkpoint = None
     if policy is not None:
-        checkpoint = policy if isinstance(policy, Checkpoint) else Checkpoint.open(policy_folder(policy))
+        checkpoint = (
+            policy if isinstance(policy, Checkpoint) else Checkpoint.open(policy_folder(policy))
+        )
     origin = checkpoint.origin if checkpoint else None
     if env is None and origin is None:
         raise UsageError("env is missing, and the policy does not name one")
-    env = env_config(env or {}, origin) if env is None or isinstance(env, Mapping) else env_of_name(env)
+    env = (
+        env_config(env or {}, origin)
+        if env is None or isinstance(env, Mapping)
+        else env_of_name(env)
+    )
     if checkpoint is None:
         return env, driver_of(kind), None
     check_policy(checkpoint, env, trust=trust)
@@ -203,7 +226,8 @@ def replay(
 ) -> Replay:
     """Run one episode of an evaluation again; warn if the policy or this program has changed since.
 
-    The policy, and a robot, a task or a mesh of the user's own, must be given again: no path in the file is opened.
+    The policy, and a robot, a task or a mesh of the user's own, must be given again: no path in the
+    file is opened.
 
     Args:
         file: The `eval.json` or its folder.
@@ -228,7 +252,10 @@ def replay(
     env = result.env(robot, task, object)
     require_equal(str(file), result, "what is given", env_spec(env), "robot", "task")
     if policy is None and result.policy not in _NO_FILES:
-        raise UsageError(f"{file} evaluates the policy {shorten(result.policy)}; give that with --policy.path=DIR")
+        raise UsageError(
+            f"{file} evaluates the policy {shorten(result.policy)}; give that with"
+            " --policy.path=DIR"
+        )
     _, driver, _ = open_driver(policy, env, result.policy, trust=trust)
     settings = result.settings
     job = RolloutJob(env, driver, settings.hold, label="last", conditions=settings.conditions)
@@ -238,4 +265,6 @@ def replay(
     for line in compare_fingerprints(str(file), dict(result.fingerprint), "this machine", here):
         _LOG.warning(line)
     episode = run_states(job, seed)
-    return Replay(by_seed[seed], job, episode, replay_differences(by_seed[seed], episode_result(job, episode)))
+    return Replay(
+        by_seed[seed], job, episode, replay_differences(by_seed[seed], episode_result(job, episode))
+    )

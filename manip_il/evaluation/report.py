@@ -1,4 +1,6 @@
-"""`report.html`: one file without network access or scripts, rendered from the template beside this module."""
+"""`report.html`: one file without network access or scripts, rendered from the template beside
+this module.
+"""
 
 import base64
 from collections.abc import Mapping
@@ -27,7 +29,10 @@ class Film:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report. Empty parts are omitted. formulas: one per line; notes: paragraphs below the tables."""
+    """A part of a report.
+
+    Empty parts are omitted. formulas: one per line; notes: paragraphs below the tables.
+    """
 
     heading: str
     lead: tuple[str, ...] = ()
@@ -40,9 +45,11 @@ class Section:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """A page: the verdict (a first sentence with numbers), further facts, sections, and how it was made.
+    """A page: the verdict (a first sentence with numbers), further facts, sections, and how it was
+    made.
 
-    command, config: the command that made it, and its options, which it fills in. fingerprint: a nested mapping.
+    command, config: the command that made it, and its options, which it fills in. fingerprint: a
+    nested mapping.
     """
 
     title: str
@@ -64,7 +71,9 @@ class Report:
         )
         filters: dict[str, Any] = environment.filters
         filters["base64"] = lambda content: base64.b64encode(content).decode("ascii")
-        filters["yaml"] = lambda tree: yaml.safe_dump(dict(tree), sort_keys=False, allow_unicode=True)
+        filters["yaml"] = lambda tree: yaml.safe_dump(
+            dict(tree), sort_keys=False, allow_unicode=True
+        )
         return environment.get_template("report.html.j2").render(report=self)
 
     def write(self, path: Path) -> None:

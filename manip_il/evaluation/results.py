@@ -25,15 +25,23 @@ if TYPE_CHECKING:
 
 FILE_NAME = "eval.json"
 # keys of every episode, in the order of `EpisodeResult`
-_KEYS = {"seed": int, "success": bool, "success_at_end": bool, "steps": int, "return": float, "phase_at_end": str}
+_KEYS = {
+    "seed": int,
+    "success": bool,
+    "success_at_end": bool,
+    "steps": int,
+    "return": float,
+    "phase_at_end": str,
+}
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeResult:
-    """One episode: `success` at some time, `success_at_end` at the last frame, `ret` the sum of rewards.
+    """One episode: `success` at some time, `success_at_end` at the last frame, `ret` the sum of
+    rewards.
 
-    steps: control steps until the episode ended. phase_at_end: the expert's name for the phase of the last state.
-    detail: further keys of the JSON object.
+    steps: control steps until the episode ended. phase_at_end: the expert's name for the phase of
+    the last state. detail: further keys of the JSON object.
     """
 
     seed: int
@@ -51,7 +59,14 @@ class EpisodeResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the episode as stored in `eval.json`."""
-        values = (self.seed, self.success, self.success_at_end, self.steps, self.ret, self.phase_at_end)
+        values = (
+            self.seed,
+            self.success,
+            self.success_at_end,
+            self.steps,
+            self.ret,
+            self.phase_at_end,
+        )
         return dict(zip(_KEYS, values, strict=True)) | dict(self.detail)
 
     @classmethod
@@ -69,9 +84,10 @@ class EpisodeResult:
 class EvalSettings:
     """The settings that two evaluations must share to be comparable, and that reproduce an episode.
 
-    horizon, success_steps: control steps. tolerance: distance to the goal that counts as success [m]. suite: the name
-    of the conditions, which episodes cycle through. hold: control steps after success at which an episode ends, None
-    if it continues to the horizon. object: shape and size of the object to grasp, empty for the task's default.
+    horizon, success_steps: control steps. tolerance: distance to the goal that counts as success
+    [m]. suite: the name of the conditions, which episodes cycle through. hold: control steps after
+    success at which an episode ends, None if it continues to the horizon. object: shape and size of
+    the object to grasp, empty for the task's default.
     """
 
     horizon: int
@@ -98,7 +114,11 @@ class EvalSettings:
     @property
     def disturbance(self) -> str:
         """The conditions in words, `none` if all are nominal."""
-        return "; ".join(map(str, self.conditions)) if any(one.ranges for one in self.conditions) else "none"
+        return (
+            "; ".join(map(str, self.conditions))
+            if any(one.ranges for one in self.conditions)
+            else "none"
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -107,7 +127,10 @@ class EvalSettings:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
-        """Return the inverse of `to_json`; raises what `EpisodeResult.from_json` does. Other keys are ignored."""
+        """Return the inverse of `to_json`; raises what `EpisodeResult.from_json` does.
+
+        Other keys are ignored.
+        """
         values: dict[str, Any] = {name: data[name] for name in _SETTINGS}
         values["conditions"] = tuple(Condition(**ranges) for ranges in data["conditions"])
         return cls(**values)
@@ -120,8 +143,9 @@ _SETTINGS = tuple(field.name for field in fields(EvalSettings))
 class EvalResult:
     """One policy on one robot and task: every episode, and the statistics derived from them.
 
-    policy_sha256: hash of the policy's files, if any. until_width: the interval width at which the evaluation was to
-    stop (intervals are then valid at any stopping time); None if the number of episodes was fixed in advance.
+    policy_sha256: hash of the policy's files, if any. until_width: the interval width at which the
+    evaluation was to stop (intervals are then valid at any stopping time); None if the number of
+    episodes was fixed in advance.
 
     Raises `ManipError` on construction if there is no episode or a seed occurs twice.
     """
@@ -146,14 +170,24 @@ class EvalResult:
             )
 
     def env(
-        self, robot: NameOrPath | None = None, task: NameOrPath | None = None, shape: NameOrPath | None = None
+        self,
+        robot: NameOrPath | None = None,
+        task: NameOrPath | None = None,
+        shape: NameOrPath | None = None,
     ) -> EnvConfig:
         """Return the environment of the evaluation.
 
         robot, task, shape: the user's own files, because results hold only the names of these.
         """
-        of, limits = self.settings, (self.settings.tolerance, self.settings.success_steps, self.settings.horizon)
-        return complete(EnvConfig(of.control_hz, *limits, robot or self.robot, task or self.task, shape or of.object))
+        of, limits = (
+            self.settings,
+            (self.settings.tolerance, self.settings.success_steps, self.settings.horizon),
+        )
+        return complete(
+            EnvConfig(
+                of.control_hz, *limits, robot or self.robot, task or self.task, shape or of.object
+            )
+        )
 
     @property
     def success(self) -> Proportion:
@@ -166,27 +200,45 @@ class EvalResult:
         return self._share("success_at_end")
 
     def _share(self, outcome: str) -> Proportion:
-        return Proportion.of([getattr(episode, outcome) for episode in self.episodes], self.until_width is not None)
+        return Proportion.of(
+            [getattr(episode, outcome) for episode in self.episodes], self.until_width is not None
+        )
 
     @cached_property
     def by_condition(self) -> dict[str, EvalResult]:
-        """Condition name -> its episodes, in the order of `settings`; "" for episodes without a condition."""
-        parts: dict[str, list[EpisodeResult]] = {condition.name: [] for condition in self.settings.conditions}
+        """Condition name -> its episodes, in the order of `settings`.
+
+        "" for episodes without a condition.
+        """
+        parts: dict[str, list[EpisodeResult]] = {
+            condition.name: [] for condition in self.settings.conditions
+        }
         for episode in self.episodes:
             parts.setdefault(episode.condition, []).append(episode)
-        return {name: replace(self, episodes=tuple(episodes)) for name, episodes in parts.items() if episodes}
+        return {
+            name: replace(self, episodes=tuple(episodes))
+            for name, episodes in parts.items()
+            if episodes
+        }
 
     @property
     def steps_to_success(self) -> float | None:
-        """Mean control steps until the first success, over successful episodes; None if no episode records it."""
-        steps = (episode.detail.get("steps_to_success") for episode in self.episodes if episode.success)
+        """Mean control steps until the first success, over successful episodes.
+
+        None if no episode records it.
+        """
+        steps = (
+            episode.detail.get("steps_to_success") for episode in self.episodes if episode.success
+        )
         known = [count for count in steps if count is not None]
         return fmean(known) if known else None
 
     @property
     def failures(self) -> dict[str, int]:
         """Failed episodes by the phase that they ended in, most frequent first."""
-        phases = Counter(sorted(episode.phase_at_end for episode in self.episodes if not episode.success))
+        phases = Counter(
+            sorted(episode.phase_at_end for episode in self.episodes if not episode.success)
+        )
         return dict(phases.most_common())  # ties keep the order of names
 
     def to_json(self) -> dict[str, Any]:
@@ -202,7 +254,9 @@ class EvalResult:
             "n_episodes": len(self.episodes),
             "success_at_end_rate": self.success_at_end.rate,
             "until_width": self.until_width,
-            "by_condition": {name: part.success.to_json() for name, part in self.by_condition.items() if name},
+            "by_condition": {
+                name: part.success.to_json() for name, part in self.by_condition.items() if name
+            },
             "policy": self.policy,
             "policy_sha256": self.policy_sha256,
             "robot": self.robot,
@@ -236,7 +290,9 @@ class EvalResult:
 
     @classmethod
     def read(cls, path: Path) -> EvalResult:
-        """Read what `write` wrote. Raises `ManipError` for a file that is missing, truncated or of another kind.
+        """Read what `write` wrote.
+
+        Raises `ManipError` for a file that is missing, truncated or of another kind.
 
         `path` may be the folder that contains `eval.json`.
         """
@@ -244,7 +300,14 @@ class EvalResult:
         data = checks.read_json(path, f"an {FILE_NAME} of manip-il eval")
         try:
             return cls.from_json(data)
-        except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, ManipError) as error:
+        except (
+            KeyError,
+            TypeError,
+            ValueError,
+            ArithmeticError,
+            AttributeError,
+            ManipError,
+        ) as error:
             why = "it has no key " * isinstance(error, KeyError) + checks.one_line(error)
             raise ManipError(f"{path}: not an {FILE_NAME}: {why}") from error
 
@@ -252,28 +315,40 @@ class EvalResult:
 def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
     """Return all episodes of the parts (name -> part), in the order of their seeds.
 
-    Raises `MismatchError` if policy or environment differ, and `ManipError` for a seed that two parts ran, or for a
-    part whose number of episodes depended on its outcomes.
+    Raises `MismatchError` if policy or environment differ, and `ManipError` for a seed that two
+    parts ran, or for a part whose number of episodes depended on its outcomes.
     """
     (first, one), *others = parts.items()
     for name, other in others:
-        known = one.policy_sha256 or other.policy_sha256  # otherwise only the names show whether the policy is the same
+        # otherwise only the names show whether the policy is the same
+        known = one.policy_sha256 or other.policy_sha256
         require_comparable(first, one, name, other, "policy_sha256" if known else "policy")
-    if stopped := next((name for name, part in parts.items() if part.until_width is not None), None):
-        raise ManipError(f"{stopped} was stopped by --until_width; merge only parts with a fixed number of episodes")
+    if stopped := next(
+        (name for name, part in parts.items() if part.until_width is not None), None
+    ):
+        raise ManipError(
+            f"{stopped} was stopped by --until_width; merge only parts with a fixed number of"
+            " episodes"
+        )
     episodes = [episode for part in parts.values() for episode in part.episodes]
     return replace(one, episodes=tuple(sorted(episodes, key=lambda episode: episode.seed)))
 
 
 def require_equal(left: str, one: object, right: str, other: object, *names: str) -> None:
-    """Raise `MismatchError` for the first attribute in which two objects differ. left, right: names of the objects."""
+    """Raise `MismatchError` for the first attribute in which two objects differ. left, right:
+    names of the objects.
+    """
     for name in names:
         ours, theirs = getattr(one, name), getattr(other, name)
         if ours != theirs:
             raise MismatchError(name, left, ours, right, theirs)
 
 
-def require_comparable(left: str, one: EvalResult, right: str, other: EvalResult, *more: str) -> None:
-    """Raise `MismatchError` if two evaluations differ in robot, task, a setting, or an attribute named in `more`."""
+def require_comparable(
+    left: str, one: EvalResult, right: str, other: EvalResult, *more: str
+) -> None:
+    """Raise `MismatchError` if two evaluations differ in robot, task, a setting, or an attribute
+    named in `more`.
+    """
     require_equal(left, one, right, other, *more, "robot", "task")
     require_equal(left, one.settings, right, other.settings, *_SETTINGS)

@@ -1,4 +1,6 @@
-"""Checks of a custom arm before anything is recorded: gripper, reach, start states, and the expert on every task."""
+"""Checks of a custom arm before anything is recorded: gripper, reach, start states, and the
+expert on every task.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -43,8 +45,9 @@ _VIEW = (4.4, 3.5)  # size of a picture of the arm [inches]
 class TaskCheck:
     """Result of one task with a robot.
 
-    starts: number of starts drawn before the first failure. refused: why that start failed, or why there is no scene.
-    clean, noisy: evaluations of the expert without and with a tenth of its actions random; None if not run.
+    starts: number of starts drawn before the first failure. refused: why that start failed, or why
+    there is no scene. clean, noisy: evaluations of the expert without and with a tenth of its
+    actions random; None if not run.
     """
 
     name: str
@@ -74,8 +77,8 @@ class TaskCheck:
 class RobotCheck:
     """Measurements of a robot. name: as given by the user.
 
-    opening: largest opening of the gripper [m]. table: share of the workspace on the table that the hand reaches
-    while it points down.
+    opening: largest opening of the gripper [m]. table: share of the workspace on the table that the
+    hand reaches while it points down.
     """
 
     name: NameOrPath
@@ -125,16 +128,23 @@ def check_robot(
         if episodes and not task.refused:
             found: list[EvalResult] = []
             for condition in (NOMINAL, read_condition("random_actions")):
-                job = RolloutJob(make_config(name, task.name), hold=HOLD, label="last", conditions=(condition,))
+                job = RolloutJob(
+                    make_config(name, task.name), hold=HOLD, label="last", conditions=(condition,)
+                )
                 seeds = stream_seeds("validation", episodes)
-                found.append(evaluate(engine, job, seeds, "expert", on_result, suite=condition.name))
+                found.append(
+                    evaluate(engine, job, seeds, "expert", on_result, suite=condition.name)
+                )
             checked[place] = replace(task, clean=found[0], noisy=found[1])
     table = float(_reached(robot, robot.workspace.half_width, 41).mean())
     return RobotCheck(name, robot, scene.gripper.most, table, tuple(checked))
 
 
 def check_starts(name: NameOrPath, task: str) -> TaskCheck:
-    """Draw up to `STARTS` starts of a task with a robot, as episodes do; stop at one without a valid placement."""
+    """Draw up to `STARTS` starts of a task with a robot, as episodes do.
+
+    Stop at one without a valid placement.
+    """
     starts = 0
     try:
         world = World(scene_of(name, task))
@@ -148,7 +158,9 @@ def check_starts(name: NameOrPath, task: str) -> TaskCheck:
 
 
 def _reached(robot: Robot, half: float, n: int) -> NDArray[np.bool_]:
-    """Return whether the hand, pointing down, reaches each point of a grid on the table, (n, n), row by row along x."""
+    """Return whether the hand, pointing down, reaches each point of a grid on the table, (n, n),
+    row by row along x.
+    """
     steps = np.linspace(-half, half, n)
     x, y = robot.workspace.centre
     points = np.stack(np.meshgrid(x + steps, y + steps, [LOW]), axis=-1)
@@ -156,22 +168,25 @@ def _reached(robot: Robot, half: float, n: int) -> NDArray[np.bool_]:
 
 
 def check_report(check: RobotCheck) -> Report:
-    """Return the HTML report of a check. Without off-screen OpenGL it says why it has no pictures."""
+    """Return the HTML report of a check.
+
+    Without off-screen OpenGL it says why it has no pictures.
+    """
     try:
         pictures, lead = (looks(check.name),), ()
     except RenderError as error:
         pictures, lead = (), (f"No pictures: {error}",)
     tasks = (
-        f"Starts: how many of {STARTS} were drawn before one found no place within reach. Random actions: a tenth of "
-        "the actions, the gripper's included."
+        f"Starts: how many of {STARTS} were drawn before one found no place within reach. Random"
+        " actions: a tenth of the actions, the gripper's included."
     )
     home = (
         "Axes of ee: x red, y (along the fingers' motion) green, z (out of the hand) blue. "
         f"The gripper opens to {1000 * check.opening:.1f} mm."
     )
     reach = (
-        "Pointing down, the hand reaches "
-        f"{100 * check.table:.0f} % of the workspace on the table (the frame). Points that it reaches are green."
+        f"Pointing down, the hand reaches {100 * check.table:.0f} % of the workspace on the table"
+        " (the frame). Points that it reaches are green."
     )
     return Report(
         title=f"{check.robot.name}: robot check",
@@ -196,7 +211,9 @@ def verdict(check: RobotCheck) -> str:
 
 
 def task_table(check: RobotCheck) -> Table:
-    """Return the table of tasks: starts, and the expert's success without and with random actions."""
+    """Return the table of tasks: starts, and the expert's success without and with random
+    actions.
+    """
     columns = ("task", "starts", f"expert {INTERVAL}", "with random actions")
     rows = tuple(
         (
@@ -217,24 +234,40 @@ def _reach_figure(robot: Robot) -> Figure:
     with drawing(1, size=(3.6, 3.6)) as (drawn, axes):
         axis = axes[0, 0]
         reached = _reached(robot, wide, 61).astype(float)
-        axis.imshow(reached, extent=extent, origin="lower", cmap="Greens", vmin=0, vmax=3, interpolation="nearest")
+        axis.imshow(
+            reached,
+            extent=extent,
+            origin="lower",
+            cmap="Greens",
+            vmin=0,
+            vmax=3,
+            interpolation="nearest",
+        )
         axis.hlines([y - half, y + half], x - half, x + half, color=INK, lw=1)
         axis.vlines([x - half, x + half], y - half, y + half, color=INK, lw=1)
-        axis.set(xlim=extent[:2], ylim=extent[2:], xlabel="x, away from the base [m]", ylabel="y, to its left [m]")
+        axis.set(
+            xlim=extent[:2],
+            ylim=extent[2:],
+            xlabel="x, away from the base [m]",
+            ylabel="y, to its left [m]",
+        )
         axis.grid(visible=False)
         return to_figure(drawn, "Where the hand reaches on the table, from above")
 
 
 def advice(check: RobotCheck) -> tuple[str, ...]:
-    """Return what to change in the robot's YAML: first for the arm, then for each task that it cannot do."""
+    """Return what to change in the robot's YAML: first for the arm, then for each task that it
+    cannot do.
+    """
     space = check.robot.workspace
     lines = _overlaps(scene_of(check.name, "reach"))
     if check.table < ENOUGH:
         x, y = space.centre
         lines.append(
-            f"The hand reaches {100 * check.table:.0f} % of the workspace on the table: reduce workspace.half_width "
-            f"(now {space.half_width:g}), or move workspace.centre (now {x:g}, {y:g}) to where the map is green; if it "
-            "is green nowhere, turn the gripper on the hand by gripper.quaternion."
+            f"The hand reaches {100 * check.table:.0f} % of the workspace on the table: reduce"
+            f" workspace.half_width (now {space.half_width:g}), or move workspace.centre (now"
+            f" {x:g}, {y:g}) to where the map is green; if it is green nowhere, turn the gripper on"
+            " the hand by gripper.quaternion."
         )
     for task in check.failed:
         if task.refused and check.table:  # if no point is within reach, the first line says so
@@ -242,21 +275,28 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
         elif task.clean is not None:
             success, phase = task.clean.success, next(iter(task.clean.failures))
             lines.append(
-                f"{task.name}: the expert fails in {success.n - success.successes} of {success.n} episodes, mostly in "
-                f"phase {phase}; watch it: manip-il view --robot.type={check.name} --task.type={task.name}"
+                f"{task.name}: the expert fails in {success.n - success.successes} of {success.n}"
+                f" episodes, mostly in phase {phase}; watch it: manip-il view"
+                f" --robot.type={check.name} --task.type={task.name}"
             )
     return tuple(lines)
 
 
 def _overlaps(scene: Scene) -> list[str]:
-    """Name the bodies that overlap at home, with their depth [mm], in a line; no line if there are none."""
+    """Name the bodies that overlap at home, with their depth [mm], in a line.
+
+    No line if there are none.
+    """
     depths = dict[str, float]()
     for contact in _at_home(scene).contact:
         bodies = sorted(scene.model.geom_bodyid[contact.geom])
         pair = " and ".join(scene.model.body(body).name.removeprefix(PREFIX) for body in bodies)
         depths[pair] = max(depths.get(pair, 0.0), -1000 * contact.dist)
     pairs = ", ".join(f"{pair} by {depth:.1f} mm" for pair, depth in depths.items())
-    remedy = "set another home or base, or exclude their contacts in the model (<exclude body1= body2=/>)."
+    remedy = (
+        "set another home or base, or exclude their contacts in the model (<exclude body1="
+        " body2=/>)."
+    )
     return [f"At home parts overlap: {pairs}: {remedy}"] if pairs else []
 
 

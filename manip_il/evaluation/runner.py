@@ -1,4 +1,6 @@
-"""Evaluate policies on given seeds: finished episodes are saved at once, and any episode can be rerun alone."""
+"""Evaluate policies on given seeds: finished episodes are saved at once, and any episode can be
+rerun alone.
+"""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -40,7 +42,9 @@ def evaluate(
     done: Mapping[int, EpisodeResult] = MappingProxyType({}),
     until_width: float | None = None,
 ) -> EvalResult:
-    """Run `job` on every seed, to the horizon unless the job has a `hold`; episodes are in the order of `seeds`.
+    """Run `job` on every seed, to the horizon unless the job has a `hold`.
+
+    Episodes are in the order of `seeds`.
 
     Args:
         engine: What runs the episodes.
@@ -50,8 +54,8 @@ def evaluate(
         on_result: Called with every result as its episode ends.
         suite: Name of the job's conditions.
         done: Seed -> result of an earlier run.
-        until_width: Stop once the width of the interval is at most this; checked after every `CHECK_EVERY` seeds in
-            order, independently of the workers.
+        until_width: Stop once the width of the interval is at most this; checked after every
+            `CHECK_EVERY` seeds in order, independently of the workers.
     """
     results: dict[int, EpisodeResult] = {}
     asked: list[int] = []
@@ -62,7 +66,9 @@ def evaluate(
             results[episode.seed] = episode_result(job, episode)
             on_result(results[episode.seed])
         if until_width is not None:
-            low, high = Proportion.of([result.success for result in results.values()], sequential=True).interval
+            low, high = Proportion.of(
+                [result.success for result in results.values()], sequential=True
+            ).interval
             if high - low <= until_width:
                 break
     spec = env_spec(job.env)
@@ -79,7 +85,8 @@ def evaluate(
 
 
 def episode_hold(env: EnvConfig, hold: int | None = HOLD) -> int | None:
-    """Return the control steps after success at which an episode ends, None if it continues to the horizon.
+    """Return the control steps after success at which an episode ends, None if it continues to the
+    horizon.
 
     `hold` does not apply to environments that define this themselves.
     """
@@ -112,13 +119,16 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
 
 
 def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
-    """Return the true positions [m] of the hand and the objects in one row of `sim_state` (m,): name -> [x, y, z].
+    """Return the true positions [m] of the hand and the objects in one row of `sim_state` (m,):
+    name -> [x, y, z].
 
     The hand is named `hand`. The first object that the arm must reach is named `object`.
     """
     world = described_env(env)
     world.set_state(State.from_vector(sim_state))
-    return {name: [round(float(value), 4) for value in at] for name, at in world.positions().items()}
+    return {
+        name: [round(float(value), 4) for value in at] for name, at in world.positions().items()
+    }
 
 
 def measure(
@@ -132,7 +142,9 @@ def measure(
     suite: str = NOMINAL.name,
     until_width: float | None = None,
 ) -> EvalResult:
-    """Return a job's evaluation in `folder`, after running the missing episodes; each is saved as it ends.
+    """Return a job's evaluation in `folder`, after running the missing episodes.
+
+    Each is saved as it ends.
 
     Raises what `finished_episodes` raises.
     """
@@ -144,17 +156,21 @@ def measure(
 
     if missing := len(set(seeds) - done.keys()):
         progress.start(f"evaluate {name}{'' if suite == NOMINAL.name else f', {suite}'}", missing)
-    result = evaluate(engine, job, seeds, name, keep, suite=suite, done=done, until_width=until_width)
+    result = evaluate(
+        engine, job, seeds, name, keep, suite=suite, done=done, until_width=until_width
+    )
     progress.close()
     result.write(folder / FILE_NAME)
     return result
 
 
 def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, EpisodeResult]:
-    """Return seed -> result of the episodes in `folder`. If the episodes' file is missing, write its first line.
+    """Return seed -> result of the episodes in `folder`.
 
-    The first line identifies policy, environment, versions and settings. Raises `MismatchError` if they differ from
-    those of `job`.
+    If the episodes' file is missing, write its first line.
+
+    The first line identifies policy, environment, versions and settings. Raises `MismatchError` if
+    they differ from those of `job`.
     """
     path = folder / EPISODES_FILE
     common: dict[str, Any] = {
@@ -174,9 +190,16 @@ def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, Ep
 
 
 def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]:
-    """Return the differences between two runs of one episode. Raises `MismatchError` if their conditions differ."""
+    """Return the differences between two runs of one episode.
+
+    Raises `MismatchError` if their conditions differ.
+    """
     was, now = before.to_json(), after.to_json()
     if (drawn := was.get("drawn", {})) != now["drawn"]:
-        raise MismatchError("what is drawn for the episode", "the file", drawn, "the replay", now["drawn"])
+        raise MismatchError(
+            "what is drawn for the episode", "the file", drawn, "the replay", now["drawn"]
+        )
     compared = ("success", "success_at_end", "steps", "return")
-    return [f"{name} was {was[name]}, is {now[name]}" for name in compared if was[name] != now[name]]
+    return [
+        f"{name} was {was[name]}, is {now[name]}" for name in compared if was[name] != now[name]
+    ]

@@ -1,4 +1,6 @@
-"""A side of a comparison or a row of a report: one policy, or one per training seed, and the rounds of their runs."""
+"""A side of a comparison or a row of a report: one policy, or one per training seed, and the
+rounds of their runs.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,11 @@ _SEED_FOLDER = re.compile(r"seed_(\d+)")
 
 @dataclass(frozen=True)
 class Member:
-    """One policy of a side: an evaluation, a checkpoint, or a run from which a rule chooses a round.
+    """One policy of a side: an evaluation, a checkpoint, or a run from which a rule chooses a
+    round.
 
-    policy: its folder; None for an evaluation, and for a run before its round is chosen. result: None until measured.
+    policy: its folder; None for an evaluation, and for a run before its round is chosen. result:
+    None until measured.
     """
 
     path: Path
@@ -47,16 +51,25 @@ class Member:
 
     @property
     def validation(self) -> EvalResult:
-        """The validation of the run's first round, in the environment and conditions of all of them."""
+        """The validation of the run's first round, in the environment and conditions of all of
+        them.
+        """
         return EvalResult.read(self.path / self.history[0].folder)
 
     def select(self, rule: Rule) -> Member:
-        """Return the member with the policy of the round that `rule` chooses. Raises `UsageError` if there is none."""
+        """Return the member with the policy of the round that `rule` chooses.
+
+        Raises `UsageError` if there is none.
+        """
         if not self.history:
             return self
         chosen = rule.select(self.history, self.name)
         folder = self.path / chosen.folder
-        return replace(self, chosen=chosen, policy=find_policy(folder / "policy" if chosen.unit == "round" else folder))
+        return replace(
+            self,
+            chosen=chosen,
+            policy=find_policy(folder / "policy" if chosen.unit == "round" else folder),
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -74,8 +87,8 @@ class Member:
 class Side:
     """One policy, or one per training seed, as reports and comparisons show it.
 
-    labels: number of expert labels that a policy learnt from, if known. disturbed: its evaluation under a disturbance,
-    if any.
+    labels: number of expert labels that a policy learnt from, if known. disturbed: its evaluation
+    under a disturbance, if any.
     """
 
     name: str
@@ -112,23 +125,34 @@ class Side:
 
 
 def select_rounds(rule: Rule, sides: Sequence[Side]) -> tuple[Rule, tuple[Side, ...]]:
-    """Return the rule with the cost limit that all runs share, and the sides with the rounds that the rule chooses."""
+    """Return the rule with the cost limit that all runs share, and the sides with the rounds
+    that the rule chooses.
+    """
     rule = rule.limited({member.name: member.history for side in sides for member in side.members})
-    return rule, tuple(replace(side, members=tuple(one.select(rule) for one in side.members)) for side in sides)
+    return rule, tuple(
+        replace(side, members=tuple(one.select(rule) for one in side.members)) for side in sides
+    )
 
 
 def read_side(path: Path, name: str = "") -> Side:
     """Return the side at `path`. Raises a one-line `UsageError` if it cannot be compared."""
     folders = path.iterdir() if path.is_dir() else ()
-    seeds = {int(match[1]): one for one in folders if (match := _SEED_FOLDER.fullmatch(one.name)) and one.is_dir()}
-    members = [replace(read_member(folder), training_seed=seed) for seed, folder in sorted(seeds.items())]
+    seeds = {
+        int(match[1]): one
+        for one in folders
+        if (match := _SEED_FOLDER.fullmatch(one.name)) and one.is_dir()
+    }
+    members = [
+        replace(read_member(folder), training_seed=seed) for seed, folder in sorted(seeds.items())
+    ]
     return Side(name or str(path), tuple(members) or (read_member(path),))
 
 
 def read_member(path: Path) -> Member:
     """Return the policy, run or evaluation at `path`. Raises `UsageError` if there is none."""
     records = read_lines(path / METRICS_FILE) if path.is_dir() else []
-    if any({"round", "iteration"} & record.keys() for record in records):  # `manip-il train` logs only steps
+    # `manip-il train` logs only steps
+    if any({"round", "iteration"} & record.keys() for record in records):
         return Member(path, history=history(records, str(path)))
     if path.is_file() or (path / FILE_NAME).is_file():
         return Member(path, result=EvalResult.read(path))
@@ -138,20 +162,26 @@ def read_member(path: Path) -> Member:
 def require_pair(left: Side, right: Side) -> None:
     """Raise `UsageError` unless two sides can be compared.
 
-    Both must be evaluations, or both policies to evaluate, with the same training seeds; the seeds of two sides with
-    one policy each may differ.
+    Both must be evaluations, or both policies to evaluate, with the same training seeds; the seeds
+    of two sides with one policy each may differ.
     """
     if len({member.result is None for side in (left, right) for member in side.members}) > 1:
         raise UsageError(
-            f"{left.name} and {right.name}: only one of them is an evaluation; give two eval.json, or two policies"
+            f"{left.name} and {right.name}: only one of them is an evaluation; give two eval.json,"
+            " or two policies"
         )
     ours, theirs = ([member.training_seed for member in side.members] for side in (left, right))
     if len(ours) != len(theirs) or (len(ours) > 1 and ours != theirs):
-        raise UsageError(f"training seeds differ: {left.name} has {ours}, {right.name} {theirs}; give the same ones")
+        raise UsageError(
+            f"training seeds differ: {left.name} has {ours}, {right.name} {theirs}; give the same"
+            " ones"
+        )
 
 
 def require_same_env(envs: Mapping[str, EnvConfig]) -> EnvConfig:
-    """Return the environment that all sides or runs share. Raises `MismatchError` for the first difference.
+    """Return the environment that all sides or runs share.
+
+    Raises `MismatchError` for the first difference.
 
     envs: name of a side or run -> its environment.
     """

@@ -23,9 +23,9 @@ _OWN = Path(__file__).with_name("conditions")  # the YAML files of `CONDITIONS`
 def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
     """Return the conditions of a suite, in the order in which seeds cycle through them.
 
-    Omits conditions without effect: those on objects if the task has none, those on cameras if the policy uses none
-    (`sees`). Limits the objects' sizes to those that the task allows. Raises `UnknownName` for an unknown suite,
-    `UsageError` for an invalid file or if no condition is left.
+    Omits conditions without effect: those on objects if the task has none, those on cameras if the
+    policy uses none (`sees`). Limits the objects' sizes to those that the task allows. Raises
+    `UnknownName` for an unknown suite, `UsageError` for an invalid file or if no condition is left.
     """
     asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
     world = world_of(env.robot)
@@ -33,23 +33,33 @@ def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Conditi
     left = tuple(condition for condition in affecting if condition is not None)
     if not left:
         blind = "" if sees else " and a policy without cameras"
-        raise UsageError(f"--suite={suite} changes nothing for {env.task}{blind}; choose another suite")
+        raise UsageError(
+            f"--suite={suite} changes nothing for {env.task}{blind}; choose another suite"
+        )
     return left
 
 
 def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
-    """Return the conditions in `--vary` merged into one, from which every episode samples; () if there are no names.
+    """Return the conditions in `--vary` merged into one, from which every episode samples.
 
-    Raises `UnknownName` for an unknown name, `UsageError` for an invalid file or if nothing has an effect.
+    () if there are no names.
+
+    Raises `UnknownName` for an unknown name, `UsageError` for an invalid file or if nothing has an
+    effect.
     """
     if not names:
         return ()
-    if odd := next((name for name in names if name not in CONDITIONS[1:] and not name.endswith(_YAML)), None):
+    if odd := next(
+        (name for name in names if name not in CONDITIONS[1:] and not name.endswith(_YAML)), None
+    ):
         raise UnknownName("--vary", odd, CONDITIONS[1:])
     asked = merged([read_condition(name) for name in names])
     kept = world_of(env.robot).affecting(env, asked, sees=sees)
     if kept is None:
-        raise UsageError(f"--vary={','.join(names)} changes nothing for {env.task}{'' if sees else ' without cameras'}")
+        raise UsageError(
+            f"--vary={','.join(names)} changes nothing for"
+            f" {env.task}{'' if sees else ' without cameras'}"
+        )
     return (kept,)
 
 
@@ -63,5 +73,7 @@ def read_condition(name: str) -> Condition:
     path = Path(name) if name.endswith(_YAML) else _OWN / f"{name}.yaml"
     tree = checks.read_yaml(path, "a YAML file of ranges")
     if not isinstance(tree, dict | None):
-        raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges")
+        raise UsageError(
+            f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges"
+        )
     return Condition(path.stem, **{str(key): value for key, value in (tree or {}).items()})

@@ -1,4 +1,6 @@
-"""Show running episodes in a window, whose sliders may drive the robot, or in Rerun, live or through a file."""
+"""Show running episodes in a window, whose sliders may drive the robot, or in Rerun, live or
+through a file.
+"""
 
 import socket
 from collections.abc import Sequence
@@ -20,9 +22,12 @@ _JPEG_QUALITY = 90
 
 
 class WindowScreen:
-    """MuJoCo's viewer for one environment, with its phase and progress; objects can be dragged with the mouse.
+    """MuJoCo's viewer for one environment, with its phase and progress.
 
-    sliders: whether the viewer's control sliders drive the robot. Raises `RenderError` if there is no display.
+    Objects can be dragged with the mouse.
+
+    sliders: whether the viewer's control sliders drive the robot. Raises `RenderError` if there is
+    no display.
     """
 
     def __init__(self, env: ManipEnv, *, sliders: bool = False):
@@ -34,7 +39,10 @@ class WindowScreen:
         """Show the world after a step, in real time; return False once the window is closed."""
         phase = f"  {self._phases[step.label.phase]}" if step.label else ""
         solved = "  solved" if step.success else ""
-        text = f"seed {step.seed}  step {step.step + 1}{phase}  progress {100 * self._env.progress:.0f} %{solved}"
+        text = (
+            f"seed {step.seed}  step {step.step + 1}{phase}  progress"
+            f" {100 * self._env.progress:.0f} %{solved}"
+        )
         self._window.show(self._env.data, self._env.world.variation, text)
         self._window.pull(self._env.data)
         return self._window.is_open
@@ -45,7 +53,8 @@ class WindowScreen:
 
 
 def slider_actions(window: Window, env: ManipEnv) -> Act:
-    """Return a driver whose action (n,) is read from a window's control sliders: joint targets and gripper command.
+    """Return a driver whose action (n,) is read from a window's control sliders: joint targets and
+    gripper command.
 
     In the first step of an episode, the action is the environment's initial controls.
     """
@@ -62,21 +71,25 @@ def slider_actions(window: Window, env: ManipEnv) -> Act:
 
 def outcome(step: Transition) -> str:
     """Return how an episode ended, given its last step."""
-    return f"seed {step.seed}: {'solved' if step.success or step.state.ever else 'not solved'}, {step.step + 1} steps"
+    return (
+        f"seed {step.seed}: {'solved' if step.success or step.state.ever else 'not solved'},"
+        f" {step.step + 1} steps"
+    )
 
 
 class RerunLog:
     """Steps of episodes, written to a file, or sent in real time to viewers that open `address`.
 
-    address: URL of the viewer, for a browser; empty if a file is written. ports: of the viewer and of the stream.
-    Raises `OSError` if the file cannot be written.
+    address: URL of the viewer, for a browser; empty if a file is written. ports: of the viewer and
+    of the stream. Raises `OSError` if the file cannot be written.
     """
 
     act = None  # a log does not drive the robot
 
     def __init__(self, env: EnvConfig, output: Path | None = None):
         if output:
-            output.open("wb").close()  # check first: rerun prints lines of its own if it cannot write
+            # check first: rerun prints lines of its own if it cannot write
+            output.open("wb").close()
         self._spec, self._frames = env_spec(env), 0
         self._clock = None if output else Clock(env.control_hz)
         self._hz = env.control_hz
@@ -85,7 +98,8 @@ class RerunLog:
         if output:
             self._stream.save(output)
         else:
-            self.ports = web, grpc = _free_port(9090), _free_port(9876)  # Rerun's default ports, if they are free
+            # Rerun's default ports, if they are free
+            self.ports = web, grpc = _free_port(9090), _free_port(9876)
             uri = self._stream.serve_grpc(grpc_port=grpc)
             rerun.serve_web_viewer(web_port=web, open_browser=False, connect_to=uri)
             self.address = f"http://localhost:{web}/?url=rerun%2Bhttp://localhost:{grpc}/proxy"
@@ -99,7 +113,9 @@ class RerunLog:
         stream.set_time(FRAME, sequence=self._frames)
         self._frames += 1
         for camera, picture in step.observation.images.items():
-            stream.log(schema.IMAGES + camera, rerun.Image(picture).compress(jpeg_quality=_JPEG_QUALITY))
+            stream.log(
+                schema.IMAGES + camera, rerun.Image(picture).compress(jpeg_quality=_JPEG_QUALITY)
+            )
         numbers = {
             schema.STATE: step.observation.state,
             schema.EXECUTED_ACTION: step.executed_action,
@@ -107,7 +123,9 @@ class RerunLog:
         }
         if step.label is not None:
             numbers[schema.ACTION] = step.label.action
-            stream.log(schema.EXPERT_PHASE, rerun.StateChange(state=self._spec.phases[step.label.phase]))
+            stream.log(
+                schema.EXPERT_PHASE, rerun.StateChange(state=self._spec.phases[step.label.phase])
+            )
         for name, value in numbers.items():
             stream.log(name, rerun.Scalars(value))
         if step.done:

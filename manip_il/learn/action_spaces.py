@@ -1,34 +1,39 @@
 """Action spaces that a policy may learn in, and the conversion to and from joint targets.
 
-Let s = (q, w) be a frame's measured joints [rad] and gripper opening [m], a = (q*, w*) its action (joint targets and
-commanded opening, as in datasets and environments), and (p, R) = FK(q) the position and rotation of `ee`:
+Let s = (q, w) be a frame's measured joints [rad] and gripper opening [m], a = (q*, w*) its action
+(joint targets and commanded opening, as in datasets and environments), and (p, R) = FK(q) the
+position and rotation of `ee`:
 
     joint_target   y = (q*, w*)
     joint_delta    y = (q* - q, w*)
     ee_delta       y = (p* - p, log(R* R^T), 0 ..., w*)      with (p*, R*) = FK(q*)
 
-`joint_target` and `joint_delta` are lossless. The opening is absolute in all three: it is a command, not a motion. With
-two arms there are two openings, each the last number of its arm.
+`joint_target` and `joint_delta` are lossless. The opening is absolute in all three: it is a
+command, not a motion. With two arms there are two openings, each the last number of its arm.
 
-`ee_delta` is a translation [m] and a rotation vector [rad] in the world frame, not the hand's: objects and goals are
-observed in the world frame, so that a motion towards an object has the same numbers for any orientation of the hand,
-and benchmarks (robosuite's OSC_POSE, gymnasium-robotics) use the same convention. It is as long as the robot's
-action, so that the network's output fits the environment; the numbers between the first six and the opening are 0 and
-are ignored. The arm needs at least six joints. Decoding finds q* near q with FK(q*) = (p + dp, exp(dR) R)
-(`ArmIK.moved`). It recovers the pose up to rounding, but not the joints: an arm with seven joints can move its elbow
-without moving the hand, which six numbers do not encode. As in the expert, a posture task that pulls towards the home
-posture determines the elbow. If the pose is out of reach, the hand approaches it.
+`ee_delta` is a translation [m] and a rotation vector [rad] in the world frame, not the hand's:
+objects and goals are observed in the world frame, so that a motion towards an object has the same
+numbers for any orientation of the hand, and benchmarks (robosuite's OSC_POSE, gymnasium-robotics)
+use the same convention. It is as long as the robot's action, so that the network's output fits the
+environment; the numbers between the first six and the opening are 0 and are ignored. The arm needs
+at least six joints. Decoding finds q* near q with FK(q*) = (p + dp, exp(dR) R) (`ArmIK.moved`). It
+recovers the pose up to rounding, but not the joints: an arm with seven joints can move its elbow
+without moving the hand, which six numbers do not encode. As in the expert, a posture task that
+pulls towards the home posture determines the elbow. If the pose is out of reach, the hand
+approaches it.
 
-Each action is relative to the state measured at its own step: an action of a plan is converted at the step in which it
-is executed, so that plans of many actions (ACT's chunks, diffusion's horizons) are also converted exactly. Policies
-that learn plans are trained, for each frame of the window, on the target minus the state of that frame.
+Each action is relative to the state measured at its own step: an action of a plan is converted at
+the step in which it is executed, so that plans of many actions (ACT's chunks, diffusion's horizons)
+are also converted exactly. Policies that learn plans are trained, for each frame of the window, on
+the target minus the state of that frame.
 
-Robots whose YAML has `lerobot` use degrees and 0 to 100 in s and a, but [m] and [rad] for the motion of the hand.
+Robots whose YAML has `lerobot` use degrees and 0 to 100 in s and a, but [m] and [rad] for the
+motion of the hand.
 
-`mlp` and `cnn` learn `joint_delta` by default. The network (`MLPNetwork`), which has the measured joints as inputs
-anyway, adds them itself, so that an exported network needs no conversion; for `joint_target` it adds nothing. All other
-conversions are in the checkpoint's processors (`action_steps`): both deltas for LeRobot's policies, and `ee_delta` for
-every policy.
+`mlp` and `cnn` learn `joint_delta` by default. The network (`MLPNetwork`), which has the measured
+joints as inputs anyway, adds them itself, so that an exported network needs no conversion; for
+`joint_target` it adds nothing. All other conversions are in the checkpoint's processors
+(`action_steps`): both deltas for LeRobot's policies, and `ee_delta` for every policy.
 """
 
 from __future__ import annotations
@@ -63,7 +68,8 @@ _POSE = 6
 class Conversion:
     """Converts actions to the targets of a space and back, row by row.
 
-    robot: the arm, for `ee_delta` only. grippers: indices of the gripper openings, which are absolute in `joint_delta`.
+    robot: the arm, for `ee_delta` only. grippers: indices of the gripper openings, which are
+    absolute in `joint_delta`.
 
     Raises `UnknownName` for an unknown robot, `UsageError` for an arm with fewer than six joints.
     """
@@ -77,11 +83,14 @@ class Conversion:
             return
         if (joints := len(self._robot.joints)) < _POSE:
             raise UsageError(
-                f"{EE_DELTA} needs an arm with at least {_POSE} joints; {self.robot} has {joints}; use {JOINT_DELTA}"
+                f"{EE_DELTA} needs an arm with at least {_POSE} joints; {self.robot} has {joints};"
+                f" use {JOINT_DELTA}"
             )
 
     def encode(self, actions: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:
-        """Convert actions (N, n), joint targets and openings, to this space, given measured joint states (N, n)."""
+        """Convert actions (N, n), joint targets and openings, to this space, given measured
+        joint states (N, n).
+        """
         if self.space == JOINT_TARGET:
             return actions
         targets = actions.copy()
@@ -93,11 +102,17 @@ class Conversion:
         for target, action, state in zip(targets, actions, states, strict=True):
             position, rotation = ik.ee_pose(self._to_radians(state[_ARM]))
             wanted, turned = ik.ee_pose(self._to_radians(action[_ARM]))
-            target[_POSITION], target[_ROTATION] = wanted - position, rotation_vector(turned @ rotation.T)
+            target[_POSITION], target[_ROTATION] = (
+                wanted - position,
+                rotation_vector(turned @ rotation.T),
+            )
         return targets
 
     def decode(self, targets: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:
-        """Convert targets (N, n) in this space to actions (N, n), joint targets and openings; inverse of `encode`."""
+        """Convert targets (N, n) in this space to actions (N, n), joint targets and openings.
+
+        Inverse of `encode`.
+        """
         if self.space == JOINT_TARGET:
             return targets
         actions = targets.copy()
@@ -117,26 +132,36 @@ class Conversion:
     def _to_radians(self, joints: NDArray[Any]) -> F64:
         """Return the joints (..., n - 1) [rad] of actions or states, in double precision."""
         in_degrees = self._robot.lerobot is not None
-        return np.radians(joints, dtype=np.float64) if in_degrees else np.asarray(joints, np.float64)
+        return (
+            np.radians(joints, dtype=np.float64) if in_degrees else np.asarray(joints, np.float64)
+        )
 
     @property
     def _robot(self) -> Robot:
         return get_robot(self.robot)
 
 
-def conversion_for(space: str, spec: EnvironmentSpec, start: Checkpoint | None = None) -> Conversion:
-    """Return the conversion to a space for data of `spec`. start: the checkpoint that a fit continues from, if any.
+def conversion_for(
+    space: str, spec: EnvironmentSpec, start: Checkpoint | None = None
+) -> Conversion:
+    """Return the conversion to a space for data of `spec`. start: the checkpoint that a fit
+    continues from, if any.
 
-    Raises `MismatchError` for a space other than `joint_target` if the data's actions are not joint targets, and for
-    `ee_delta` if the data's joint names are not the robot's. Also raises what `Conversion` raises.
+    Raises `MismatchError` for a space other than `joint_target` if the data's actions are not joint
+    targets, and for `ee_delta` if the data's joint names are not the robot's. Also raises what
+    `Conversion` raises.
     """
     grippers = start.grippers if start is not None else GRIPPERS.get(spec.action_meaning, LAST)
     found = Conversion(space, spec.robot if space == EE_DELTA else "", grippers)
     if space != JOINT_TARGET and spec.action_meaning not in JOINT_TARGETS:
         needed = " or ".join(JOINT_TARGETS)
-        raise MismatchError("meaning of the action", "the dataset", spec.action_meaning, space, needed)
+        raise MismatchError(
+            "meaning of the action", "the dataset", spec.action_meaning, space, needed
+        )
     if space == EE_DELTA and (names := found._robot.joint_names) != spec.joint_names:
-        raise MismatchError("list of joint names", "the dataset", spec.joint_names, f"robot {spec.robot}", names)
+        raise MismatchError(
+            "list of joint names", "the dataset", spec.joint_names, f"robot {spec.robot}", names
+        )
     return found
 
 

@@ -21,14 +21,17 @@ _GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue: ITU-R BT.601
 
 def generator_of(*key: int) -> torch.Generator:
     """Return a CPU generator whose draws depend only on the key."""
-    return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
+    return torch.Generator().manual_seed(
+        int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1)
+    )
 
 
 class Order:
-    """Row numbers in batches: a new shuffle of all rows every epoch, or draws in proportion to weights.
+    """Row numbers in batches: a new shuffle of all rows every epoch, or draws in proportion to
+    weights.
 
-    weights: one per row, (N,), to draw with replacement; None for epochs. A batch depends only on the seed and the
-    step, so there is no state to save.
+    weights: one per row, (N,), to draw with replacement; None for epochs. A batch depends only on
+    the seed and the step, so there is no state to save.
     """
 
     def __init__(self, rows: int, weights: F64 | None, batch_size: int, seed: int) -> None:
@@ -44,8 +47,12 @@ class Order:
             draws = np.random.default_rng([self.seed, step]).uniform(size=self.batch_size)
             return np.minimum(np.searchsorted(self._edges, draws, side="right"), self.rows - 1)
         start, end = step * self.batch_size, (step + 1) * self.batch_size
-        epochs = [(epoch, epoch * self.rows) for epoch in range(start // self.rows, -(-end // self.rows))]
-        return np.concatenate([self._permutation(e)[max(start - first, 0) : end - first] for e, first in epochs])
+        epochs = [
+            (epoch, epoch * self.rows) for epoch in range(start // self.rows, -(-end // self.rows))
+        ]
+        return np.concatenate(
+            [self._permutation(e)[max(start - first, 0) : end - first] for e, first in epochs]
+        )
 
     def _permutation(self, epoch: int) -> I64:
         if epoch != self._epoch:
@@ -55,7 +62,9 @@ class Order:
 
 
 def to_float(pictures: Tensor) -> Tensor:
-    """Return pixel values 0 to 255 (B, ...) as float32 in [0, 1], equal to those of LeRobot's loader."""
+    """Return pixel values 0 to 255 (B, ...) as float32 in [0, 1], equal to those of LeRobot's
+    loader.
+    """
     return pictures.to(torch.float32).div_(255)
 
 
@@ -68,9 +77,10 @@ def pictures_to_float(batch: dict[str, Any], cameras: Iterable[str]) -> dict[str
 class Augment:
     """Random crops and colour jitter.
 
-    shift: largest shift of a crop in each direction [pixels]; the border repeats the outermost pixels (DrQ, Kostrikov
-    et al. 2020, arXiv:2004.13649). brightness, contrast, saturation: largest deviation of each factor from 1, as in
-    torchvision's `ColorJitter`, but in a fixed order (saturation, contrast, brightness) with one clamp at the end.
+    shift: largest shift of a crop in each direction [pixels]; the border repeats the outermost
+    pixels (DrQ, Kostrikov et al. 2020, arXiv:2004.13649). brightness, contrast, saturation: largest
+    deviation of each factor from 1, as in torchvision's `ColorJitter`, but in a fixed order
+    (saturation, contrast, brightness) with one clamp at the end.
     """
 
     shift: int = 4
@@ -79,7 +89,8 @@ class Augment:
     saturation: float = 0.2
 
     def __call__(self, pictures: Tensor, generator: torch.Generator) -> Tensor:
-        """Return pictures uint8 (B, 3, H, W) or (B, T, 3, H, W), on any device, as float32 of that shape in [0, 1].
+        """Return pictures uint8 (B, 3, H, W) or (B, T, 3, H, W), on any device, as float32 of that
+        shape in [0, 1].
 
         Crop and colours are drawn once per sample, the same for all T, from a generator on the CPU.
         """
@@ -89,7 +100,10 @@ class Augment:
         amounts = torch.tensor([self.saturation, self.contrast, self.brightness])
         factors = 1 + amounts * (2 * torch.rand(len(pictures), 3, generator=generator) - 1)
         times = math.prod(pictures.shape[1:-3])
-        drawn = moves.repeat_interleave(times, 0), factors.repeat_interleave(times, 0).to(flat.device)
+        drawn = (
+            moves.repeat_interleave(times, 0),
+            factors.repeat_interleave(times, 0).to(flat.device),
+        )
         parts = (each.split(_AT_ONCE) for each in (changed, flat, *drawn))
         for target, source, move, factor in zip(*parts, strict=True):
             _crop(source, move, self.shift, target)
@@ -98,7 +112,9 @@ class Augment:
 
 
 def _crop(pictures: Tensor, moves: Tensor, shift: int, target: Tensor) -> None:
-    """Crop pictures (B, 3, H, W), padded by `shift` pixels, starting at row and column `moves` (B, 2)."""
+    """Crop pictures (B, 3, H, W), padded by `shift` pixels, starting at row and column `moves`
+    (B, 2).
+    """
     height, width = pictures.shape[-2:]
     padded = functional.pad(pictures.float(), (shift,) * 4, mode="replicate")
     for one, source, (y, x) in zip(target, padded, moves.tolist(), strict=True):
@@ -108,9 +124,9 @@ def _crop(pictures: Tensor, moves: Tensor, shift: int, target: Tensor) -> None:
 def _jitter(values: Tensor, factors: Tensor) -> None:
     """Jitter pictures (B, 3, H, W) in place; values 0 to 255 become 0 to 1.
 
-    factors: saturation, contrast, brightness, (B, 3). Saturation blends with the grey picture, contrast with its mean,
-    brightness with black. The sum is `own * picture + shared * grey + level`, which needs no matrix product, whose
-    precision torch may lower.
+    factors: saturation, contrast, brightness, (B, 3). Saturation blends with the grey picture,
+    contrast with its mean, brightness with black. The sum is `own * picture + shared * grey +
+    level`, which needs no matrix product, whose precision torch may lower.
     """
     saturation, contrast, brightness = factors.view(-1, 3, 1, 1).unbind(1)
     grey = values[:, 0] * _GREY[0]

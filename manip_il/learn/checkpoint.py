@@ -1,8 +1,9 @@
 """A `pretrained_model` folder, possibly downloaded: it is checked before anything in it is loaded.
 
-LeRobot's language and vision policies load tokenizers, encoders and whole models that the checkpoint names, some with
-`trust_remote_code`, which runs Python from the named repository. Policies that are built only from their own
-configuration and weights are listed in `PLAIN`, their processors' steps in `_STEPS`; all others need `--trust=true`.
+LeRobot's language and vision policies load tokenizers, encoders and whole models that the
+checkpoint names, some with `trust_remote_code`, which runs Python from the named repository.
+Policies that are built only from their own configuration and weights are listed in `PLAIN`, their
+processors' steps in `_STEPS`; all others need `--trust=true`.
 
 Find the policy in a `pretrained_model` folder, a checkpoint or a run.
 """
@@ -20,7 +21,14 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.data.fingerprint import policy_sha256
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, MUST_AGREE, STATE, check_same_spec
+from manip_il.data.schema import (
+    ACTION,
+    ENVIRONMENT_STATE,
+    IMAGES,
+    MUST_AGREE,
+    STATE,
+    check_same_spec,
+)
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.names import ACTION_SPACES, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
 from manip_il.sim.config import CameraConfig, Look
@@ -29,14 +37,16 @@ from manip_il.worlds.contract import EnvironmentSpec
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
 META_FILE = "manip_il.json"
-MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that convert actions
+# steps that convert actions
+MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"
 JOINTS_ALONE = "manip_il_joints_alone"  # step of a policy that observes nothing else
 _STEPS = (  # registry names of LeRobot's default steps, and ours: they load nothing
     *("rename_observations_processor", "to_batch_processor", "device_processor"),
     *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER, JOINTS_ALONE),
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-_PLACEHOLDER = "empty_camera_"  # prefix of dummy cameras that LeRobot's language policies fill in themselves
+# prefix of dummy cameras that LeRobot's language policies fill in themselves
+_PLACEHOLDER = "empty_camera_"
 _MLP_SHAPE = (  # options that define an mlp's architecture
     *("width", "depth", "activation", "loss", "components", "bins", "sigma", "clamp", "scales"),
     *("scaled", "grippers", "action_space"),
@@ -45,11 +55,13 @@ _MLP_SHAPE = (  # options that define an mlp's architecture
 
 @dataclass(frozen=True)
 class Origin:
-    """Content of `manip_il.json`: a policy's robot and task, its training data, and the options of its fit.
+    """Content of `manip_il.json`: a policy's robot and task, its training data, and the options of
+    its fit.
 
-    observation: one of `OBSERVATIONS`. cameras, image_size: those of its training pictures, if any; look: the lighting
-    of these pictures, as arguments of `sim.look.Look`, None if unknown. datasets: name, frames and weight of each.
-    action_space: the space that it learnt in, None for a checkpoint older than this field.
+    observation: one of `OBSERVATIONS`. cameras, image_size: those of its training pictures, if any;
+    look: the lighting of these pictures, as arguments of `sim.look.Look`, None if unknown.
+    datasets: name, frames and weight of each. action_space: the space that it learnt in, None for a
+    checkpoint older than this field.
     """
 
     robot: str
@@ -85,7 +97,9 @@ class Origin:
         look: Mapping[str, Any] | None = None,
         **more: Any,
     ) -> Origin:
-        """Return the origin of a policy trained on data of `spec`. more: other fields of `Origin`."""
+        """Return the origin of a policy trained on data of `spec`. more: other fields of
+        `Origin`.
+        """
         pictured = observation != "state"
         return cls(
             **{name: getattr(spec, name) for name in ("task", *MUST_AGREE)},
@@ -103,15 +117,20 @@ class Origin:
         return {name: value for name, value in asdict(self).items() if value or name != "object"}
 
     def check_fits(self, spec: EnvironmentSpec) -> None:
-        """Raise `MismatchError` naming both sides unless states and actions mean the same as in `spec`."""
+        """Raise `MismatchError` naming both sides unless states and actions mean the same as in
+        `spec`.
+        """
         names, seen = spec.environment_state_names, self.observation != "images"
         other_task = seen and self.environment_state_names != names and self.task != spec.task
         ours = self if seen and not other_task else replace(self, environment_state_names=names)
-        check_same_spec("the policy", ours, f"{spec.robot}/{spec.task}", spec, ("task",) if other_task else ())
+        check_same_spec(
+            "the policy", ours, f"{spec.robot}/{spec.task}", spec, ("task",) if other_task else ()
+        )
 
 
 def read_origin(path: Path) -> Origin | None:
-    """Return the origin in a `pretrained_model` folder, or None if another tool (lerobot-train) wrote it.
+    """Return the origin in a `pretrained_model` folder, or None if another tool (lerobot-train)
+    wrote it.
 
     Raises `ManipError` for a file that is incomplete or not ours.
     """
@@ -126,9 +145,10 @@ def read_origin(path: Path) -> Origin | None:
 class Checkpoint:
     """A policy on disk. path: its `pretrained_model` folder. config: its `config.json`.
 
-    numbers: numeric input column -> size; pictures: camera -> (height, width) [pixels]; action: size of the action.
-    space: the action space that the policy learnt in; robot: the arm, for `ee_delta` only; grippers: see `Conversion`.
-    origin: None if another program wrote the folder. processors: file -> steps, each with `registry_name` and `config`.
+    numbers: numeric input column -> size; pictures: camera -> (height, width) [pixels]; action:
+    size of the action. space: the action space that the policy learnt in; robot: the arm, for
+    `ee_delta` only; grippers: see `Conversion`. origin: None if another program wrote the folder.
+    processors: file -> steps, each with `registry_name` and `config`.
     """
 
     path: Path
@@ -150,14 +170,24 @@ class Checkpoint:
     def open(cls, path: Path) -> Checkpoint:
         """Read and check the files of a folder, except its weights.
 
-        Raises `ManipError` if the folder is incomplete or gives a processor's step by an import path.
+        Raises `ManipError` if the folder is incomplete or gives a processor's step by an import
+        path.
         """
         path = Path(path)
         config, origin = read_config(path), read_origin(path)
-        processors = {name: processor_steps(path / name) for name in PROCESSORS if (path / name).is_file()}
+        processors = {
+            name: processor_steps(path / name) for name in PROCESSORS if (path / name).is_file()
+        }
         with in_one_line(f"{path / CONFIG} has features that cannot be read"):
-            inputs, outputs = _features(config["input_features"]), _features(config["output_features"])
-            sizes = {key.removeprefix(IMAGES): shape[1:] for key, (kind, shape) in inputs.items() if kind == "VISUAL"}
+            inputs, outputs = (
+                _features(config["input_features"]),
+                _features(config["output_features"]),
+            )
+            sizes = {
+                key.removeprefix(IMAGES): shape[1:]
+                for key, (kind, shape) in inputs.items()
+                if kind == "VISUAL"
+            }
             space, robot, grippers = _space(config, processors.get(PROCESSORS[1], []))
             return cls(
                 path,
@@ -165,7 +195,8 @@ class Checkpoint:
                 numbers={
                     key: math.prod(shape)
                     for key, (kind, shape) in inputs.items()
-                    if kind in ("STATE", "ENV") and all(shape)  # not the environment state of `JointsAloneStep`
+                    # not the environment state of `JointsAloneStep`
+                    if kind in ("STATE", "ENV") and all(shape)
                 },
                 pictures={
                     name: (height, width)
@@ -192,7 +223,10 @@ class Checkpoint:
 
     @property
     def options(self) -> dict[str, Any]:
-        """The policy's options. Weights that torchvision would download are left out: the checkpoint has them."""
+        """The policy's options.
+
+        Weights that torchvision would download are left out: the checkpoint has them.
+        """
         options = {name: value for name, value in self.config.items() if name != "type"}
         return options | dict.fromkeys({"pretrained_backbone_weights"} & options.keys())
 
@@ -207,8 +241,8 @@ class Checkpoint:
     def cameras(self) -> CameraConfig | None:
         """Cameras, picture size and lighting as in training; None if the policy takes no pictures.
 
-        The lighting is the default if the checkpoint has none. Raises `UsageError` for cameras that environments
-        do not have, and for an invalid size.
+        The lighting is the default if the checkpoint has none. Raises `UsageError` for cameras that
+        environments do not have, and for an invalid size.
         """
         if not self.pictures:
             return None
@@ -219,18 +253,29 @@ class Checkpoint:
 
     @property
     def mlp_options(self) -> dict[str, Any] | None:
-        """The options for building another mlp of this architecture; None for another kind of policy."""
+        """The options for building another mlp of this architecture.
+
+        None for another kind of policy.
+        """
         if self.kind != MLP:
             return None
         return {name: self.config[name] for name in ("type", *_MLP_SHAPE)}
 
     def check_fits(self, spec: EnvironmentSpec) -> None:
-        """Raise `MismatchError` naming both sides unless environments of `spec` have the policy's inputs and action."""
+        """Raise `MismatchError` naming both sides unless environments of `spec` have the
+        policy's inputs and action.
+        """
         if self.origin is not None:
             self.origin.check_fits(spec)
         environment, joints = f"{spec.robot}/{spec.task}", len(spec.joint_names)
-        has: dict[str, Any] = {"robot of the inverse kinematics": spec.robot, STATE: joints, ACTION: joints}
-        has |= {ENVIRONMENT_STATE: len(spec.environment_state_names)} | dict.fromkeys(spec.image_keys, spec.image_size)
+        has: dict[str, Any] = {
+            "robot of the inverse kinematics": spec.robot,
+            STATE: joints,
+            ACTION: joints,
+        }
+        has |= {ENVIRONMENT_STATE: len(spec.environment_state_names)} | dict.fromkeys(
+            spec.image_keys, spec.image_size
+        )
         needs: dict[str, Any] = {**self.numbers, ACTION: self.action}
         needs |= {IMAGES + camera: size for camera, size in self.pictures.items()}
         needs |= {"robot of the inverse kinematics": self.robot} if self.robot else {}
@@ -239,22 +284,32 @@ class Checkpoint:
                 raise MismatchError(what, "the policy", needed, environment, has.get(what))
 
     def require_trust(self, trust: bool) -> None:
-        """Raise `ManipError` if the policy or its processors load models by name, unless `trust` is given."""
+        """Raise `ManipError` if the policy or its processors load models by name, unless `trust`
+        is given.
+        """
         steps = [step for steps in self.processors.values() for step in steps]
         require_trust(self.config, str(self.path), trust, steps)
 
 
 def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Return name -> kind and shape of a policy's inputs or outputs."""
-    return {key: (str(value["type"]), tuple(map(int, value["shape"]))) for key, value in features.items()}
+    return {
+        key: (str(value["type"]), tuple(map(int, value["shape"])))
+        for key, value in features.items()
+    }
 
 
-def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tuple[str, str, tuple[int, ...]]:
-    """Return action space, robot and grippers: from the configuration of mlp and cnn, or the postprocessor's step.
+def _space(
+    config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]
+) -> tuple[str, str, tuple[int, ...]]:
+    """Return action space, robot and grippers: from the configuration of mlp and cnn, or the
+    postprocessor's step.
 
     Where no grippers are named, only the last number counts as one.
     """
-    decoder: Mapping[str, Any] = next((step["config"] for step in steps if step["registry_name"] == DECODER), {})
+    decoder: Mapping[str, Any] = next(
+        (step["config"] for step in steps if step["registry_name"] == DECODER), {}
+    )
     given = config if config["type"] in OWN_SPACE else {"action_space": JOINT_TARGET, **decoder}
     space = given["action_space"]
     if space not in ACTION_SPACES:
@@ -264,7 +319,9 @@ def _space(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> tup
 
 @contextmanager
 def in_one_line(what: str) -> Iterator[None]:
-    """Turn every error that a library raises on a malformed file into a one-line `ManipError`, `what: ...`."""
+    """Turn every error that a library raises on a malformed file into a one-line `ManipError`,
+    `what: ...`.
+    """
     try:
         yield
     except ManipError:
@@ -276,10 +333,11 @@ def in_one_line(what: str) -> Iterator[None]:
 def require_trust(
     settings: Mapping[str, Any], source: str, trust: bool, steps: Sequence[Mapping[str, Any]] = ()
 ) -> None:
-    """Raise `ManipError`, listing the names, if a policy loads models or files by name, unless `trust` is given.
+    """Raise `ManipError`, listing the names, if a policy loads models or files by name, unless
+    `trust` is given.
 
-    settings: the policy's options with `type`, as in `config.json`. source: where they come from, for the message.
-    steps: the processors' steps.
+    settings: the policy's options with `type`, as in `config.json`. source: where they come from,
+    for the message. steps: the processors' steps.
     """
     kind, named = settings["type"], list[Any]()
     if kind not in PLAIN or settings.get("vision_encoder_name"):
@@ -290,8 +348,9 @@ def require_trust(
     texts = sorted({value for value in named if isinstance(value, str)})
     if (kind not in PLAIN or texts) and not trust:
         raise ManipError(
-            f"{source} is a policy of type {kind!r}, whose configuration names what to load ({checks.shorten(texts)}): "
-            "this downloads files and may run code in them; if you trust its source, add --trust=true"
+            f"{source} is a policy of type {kind!r}, whose configuration names what to load"
+            f" ({checks.shorten(texts)}): this downloads files and may run code in them; if you"
+            " trust its source, add --trust=true"
         )
 
 
@@ -301,14 +360,17 @@ def read_config(path: Path) -> dict[str, Any]:
     if not (path / WEIGHTS).is_file():
         raise ManipError(f"no {WEIGHTS} in {path}: the weights are missing")
     if not isinstance(config.get("type"), str):
-        raise ManipError(f"{path / CONFIG} is not the configuration of a LeRobot policy: it has no type")
+        raise ManipError(
+            f"{path / CONFIG} is not the configuration of a LeRobot policy: it has no type"
+        )
     return config
 
 
 def processor_steps(path: Path) -> list[dict[str, Any]]:
     """Return the steps in a processor's file, each with `registry_name` and `config`.
 
-    Refuses steps given by import path, because LeRobot would import and call whatever a downloaded file names.
+    Refuses steps given by import path, because LeRobot would import and call whatever a downloaded
+    file names.
     """
     values = checks.read_json(path, "a processor of LeRobot's")
     with in_one_line(f"{path} cannot be read"):
@@ -316,7 +378,10 @@ def processor_steps(path: Path) -> list[dict[str, Any]]:
             name = checks.shorten(odd.get("class"))
             raise ManipError(f"{path} asks to run {name}; only registered steps are loaded")
         return [
-            {"registry_name": str(step["registry_name"]), "config": checks.mapping("config", step.get("config", {}))}
+            {
+                "registry_name": str(step["registry_name"]),
+                "config": checks.mapping("config", step.get("config", {})),
+            }
             for step in values["steps"]
         ]
 
@@ -327,7 +392,8 @@ _REPO = re.compile(r"[A-Za-z0-9_][\w.-]*/[A-Za-z0-9_][\w.-]*")
 
 
 def find_policy(path: Path) -> Path:
-    """Return `path` if it is a `pretrained_model` folder, else the best or newest one in this checkpoint or run.
+    """Return `path` if it is a `pretrained_model` folder, else the best or newest one in this
+    checkpoint or run.
 
     Raises `UsageError` if there is none.
     """
@@ -342,18 +408,27 @@ def find_policy(path: Path) -> Path:
 
 
 def hub_hint(path: Path, kind: str = "") -> str:
-    """Return how to pull `path` if it looks like a Hub repository, else "". kind: `datasets/` for a dataset."""
+    """Return how to pull `path` if it looks like a Hub repository, else "". kind: `datasets/`
+    for a dataset.
+    """
     if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
         return ""
-    return f"; if it is on the Hub, get it by manip-il pull hf://{kind}{path} FOLDER and give that FOLDER"
+    return (
+        f"; if it is on the Hub, get it by manip-il pull hf://{kind}{path} FOLDER and give that"
+        " FOLDER"
+    )
 
 
 def policy_folder(policy: Any) -> Path:
-    """Return the `pretrained_model` folder of a `Checkpoint`, or of a path that `find_policy` takes."""
+    """Return the `pretrained_model` folder of a `Checkpoint`, or of a path that `find_policy`
+    takes.
+    """
     return find_policy(Path(getattr(policy, "path", policy)).expanduser())
 
 
 def with_folder(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a fit's policy, with the `pretrained_model` folder that a `path` among them leads to."""
+    """Return the options of a fit's policy, with the `pretrained_model` folder that a `path`
+    among them leads to.
+    """
     path = options.get("path")
     return dict(options) if path is None else {**options, "path": str(policy_folder(path))}

@@ -1,6 +1,8 @@
-"""The `cnn` policy in LeRobot's form: one action from joint state and the keypoints of every camera.
+"""The `cnn` policy in LeRobot's form: one action from joint state and the keypoints of every
+camera.
 
-Options, policy and processors are in one module that LeRobot can treat as a package: see `manip_il.learn.mlp`.
+Options, policy and processors are in one module that LeRobot can treat as a package: see
+`manip_il.learn.mlp`.
 """
 
 from collections.abc import Sequence
@@ -28,37 +30,44 @@ __all__ = ["CNNConfig", "CNNPolicy", "make_cnn_pre_post_processors"]
 __path__: list[str] = []
 
 NUMBERS = 4  # numbers per keypoint: x, y, spread, strength
-_LIGHT, _COLOUR = 4.0, 16.0  # pictures vary far more in brightness than in colour; these scales equalise them
+# pictures vary far more in brightness than in colour; these scales equalise them
+_LIGHT, _COLOUR = 4.0, 16.0
 _SHARPNESS = 3.0  # gain before the softmax
 _SPREAD, _STRENGTH = 4.0, 0.3  # scale spread and strength to about -2 to 2
 DRAWS = 16  # noisy true states per row of a batch, if `states` is given
-MOST_NOISE = 2.0  # largest standard deviation of this noise, as a multiple of the prediction's mean error in training
+# largest standard deviation of this noise, as a multiple of the prediction's mean error in training
+MOST_NOISE = 2.0
 _MEMORY = 0.99  # weight of the previous value in the running mean of that error
 
 
 @PreTrainedConfig.register_subclass("cnn")
 @dataclass
 class CNNConfig(MLPConfig):
-    """A small convolutional network that finds keypoints in every camera's picture, and the mlp's perceptron on top.
+    """A small convolutional network that finds keypoints in every camera's picture, and the mlp's
+    perceptron on top.
 
-    On a CPU with bfloat16, `use_amp` trains the convolutions in half precision, which is twice as fast. Acting is
-    always in single precision. All options that are not listed are the mlp's.
+    On a CPU with bfloat16, `use_amp` trains the convolutions in half precision, which is twice as
+    fast. Acting is always in single precision. All options that are not listed are the mlp's.
 
     Args:
-        channels: Number in each convolutional layer; the first two layers halve the picture's sides, the others keep
-            them.
+        channels: Number in each convolutional layer; the first two layers halve the picture's
+            sides, the others keep them.
         keypoints: Number per camera.
-        aux_weight: Weight of the loss of a second perceptron, which predicts `observation.environment_state` from
-            joints and keypoints if the dataset has it and it is not an input. The loss is the mean absolute error in
-            standard deviations. The action is predicted from joints, keypoints and this predicted state; the true
-            state is never used to act.
-        scales: As in the mlp, but for the offsets in the environment state, predicted or, if it is an input, true.
+        aux_weight: Weight of the loss of a second perceptron, which predicts
+            `observation.environment_state` from joints and keypoints if the dataset has it and it
+            is not an input. The loss is the mean absolute error in standard deviations. The action
+            is predicted from joints, keypoints and this predicted state; the true state is never
+            used to act.
+        scales: As in the mlp, but for the offsets in the environment state, predicted or, if it is
+            an input, true.
         scaled: The indices of these offsets in the environment state.
-        states: A dataset without pictures. If given, the mlp's network predicts the action from joints and predicted
-            state alone. It is trained on the true states of this dataset and of the frames with pictures, plus noise
-            of the size of the prediction's error (the "independent" concept bottleneck of Koh et al., ICML 2020).
+        states: A dataset without pictures. If given, the mlp's network predicts the action from
+            joints and predicted state alone. It is trained on the true states of this dataset and
+            of the frames with pictures, plus noise of the size of the prediction's error (the
+            "independent" concept bottleneck of Koh et al., ICML 2020).
         privileged_size: Size of the predicted state, taken from the dataset.
-        named_points, heatmap_weight: In checkpoints that learnt heat maps: further keypoints; no effect.
+        named_points, heatmap_weight: In checkpoints that learnt heat maps: further keypoints, and
+            no effect.
 
     Raises:
         UsageError: A size or a weight is out of range, or what `MLPConfig` raises.
@@ -67,7 +76,9 @@ class CNNConfig(MLPConfig):
     channels: tuple[int, ...] = (16, 32, 32, 32)
     keypoints: int = option(32, "keypoints per camera", at_least=1)
     aux_weight: float = option(0.5, "weight of the loss of the predicted state", at_least=0)
-    states: str = option("", "dataset of states; the policy then acts on joints and predicted state alone")
+    states: str = option(
+        "", "dataset of states; the policy then acts on joints and predicted state alone"
+    )
     privileged_size: int = 0
     named_points: int = 0
     heatmap_weight: float = 0.0
@@ -80,7 +91,9 @@ class CNNConfig(MLPConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if len(self.channels) < 2 or min(self.channels) < 1:
-            raise UsageError(f"policy.channels is {shorten(list(self.channels))}; expected at least 2 numbers")
+            raise UsageError(
+                f"policy.channels is {shorten(list(self.channels))}; expected at least 2 numbers"
+            )
         self.keypoints += self.named_points
         self.named_points = 0
 
@@ -89,18 +102,24 @@ class CNNConfig(MLPConfig):
         """Raise unless there are `observation.state`, `action` of the same size, and pictures."""
         super().validate_features()
         if self.states and self.action_space == EE_DELTA:
-            raise UsageError(f"policy.states cannot be combined with {EE_DELTA}; expected {JOINT_DELTA}")
+            raise UsageError(
+                f"policy.states cannot be combined with {EE_DELTA}; expected {JOINT_DELTA}"
+            )
         if not self.image_features:
             have = ", ".join(self.input_features or {})
-            raise UsageError(f"the cnn policy needs pictures (observation.images.*); the inputs are {have}")
+            raise UsageError(
+                f"the cnn policy needs pictures (observation.images.*); the inputs are {have}"
+            )
 
 
 class CNNPolicy(MLPPolicy):
-    """LeRobot's policy interface to one `KeypointEncoder` per camera and an `MLPNetwork` on joints and keypoints.
+    """LeRobot's policy interface to one `KeypointEncoder` per camera and an `MLPNetwork` on joints
+    and keypoints.
 
-    Batches hold the same columns as the mlp's (`observation.environment_state` only if it is an input, or in training
-    to be predicted) and `observation.images.<camera>` (B, 3, H, W), from 0 to 1. Pictures that are larger than in
-    training, as those of `lerobot-eval` may be, are reduced to that size by averaging.
+    Batches hold the same columns as the mlp's (`observation.environment_state` only if it is an
+    input, or in training to be predicted) and `observation.images.<camera>` (B, 3, H, W), from 0 to
+    1. Pictures that are larger than in training, as those of `lerobot-eval` may be, are reduced to
+    that size by averaging.
     """
 
     config: CNNConfig
@@ -113,14 +132,21 @@ class CNNPolicy(MLPPolicy):
     @override
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """Return one action per row, (B, n), as `MLPPolicy` does; bit-identical whatever the other rows are."""
+        """Return one action per row, (B, n), as `MLPPolicy` does.
+
+        Bit-identical whatever the other rows are.
+        """
         state = batch[STATE]
         if len(state) == 0:
             return torch.empty_like(state)
-        # The last bits of a convolution depend on the batch size, so one row at a time. Half precision is for training.
+        # The last bits of a convolution depend on the batch size, so one row at a time. Half
+        # precision is for training.
         with torch.autocast(state.device.type, enabled=False):
             keys = (*self.inputs, *self.cameras)
-            rows = [self.network_inputs({key: batch[key][i : i + 1] for key in keys}) for i in range(len(state))]
+            rows = [
+                self.network_inputs({key: batch[key][i : i + 1] for key in keys})
+                for i in range(len(state))
+            ]
             return self.model.act(torch.cat(rows))
 
     @override
@@ -128,16 +154,21 @@ class CNNPolicy(MLPPolicy):
         features = config.input_features or {}
         self.cameras = sorted(config.image_features)
         config.input_features = {key: features[key] for key in (*self.inputs, *self.cameras)}
-        self._states: tuple[Tensor, ...] = ()  # with `states`: joints and true state, and action, of labelled frames
+        # with `states`: joints and true state, and action, of labelled frames
+        self._states: tuple[Tensor, ...] = ()
         self.predicts = False  # whether the data have the true state to be predicted
         self._build_networks()
 
     def _build_networks(self) -> None:
-        """Build the encoders, the perceptron that predicts the state and the one that predicts the action."""
+        """Build the encoders, the perceptron that predicts the state and the one that predicts
+        the action.
+        """
         config = self.config
         features, size = config.input_features or {}, config.privileged_size
         n = features[STATE].shape[0]
-        self.encoders = nn.ModuleList([KeypointEncoder(config.channels, config.keypoints) for _ in self.cameras])
+        self.encoders = nn.ModuleList(
+            [KeypointEncoder(config.channels, config.keypoints) for _ in self.cameras]
+        )
         seen = sum(features[key].shape[0] for key in self.inputs)
         self.seen_size = seen + NUMBERS * config.keypoints * len(self.cameras)
         self.privileged = None
@@ -147,22 +178,26 @@ class CNNPolicy(MLPPolicy):
             self.register_buffer("truth_scale", torch.ones(size))
         self.offsets = list(config.scaled) if size or ENVIRONMENT_STATE in self.inputs else []
         if config.states:
-            self.register_buffer("error", torch.zeros(size))  # mean absolute error of the predicted state in training
+            # mean absolute error of the predicted state in training
+            self.register_buffer("error", torch.zeros(size))
             width, scaled = n + size, {"scaled": [n + i for i in self.offsets]}
         else:
-            width, scaled = self.seen_size + size, {"scales": ()}  # the cnn scales the offsets itself
+            # the cnn scales the offsets itself
+            width, scaled = self.seen_size + size, {"scales": ()}
             width += len(config.scales) * len(self.offsets)
         self.model = MLPNetwork(width, n, NetworkConfig.of(vars(config) | scaled))
 
     @override
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
-        """Return the action network's inputs, (B, d): measured inputs, keypoints, predicted state, scaled offsets.
+        """Return the action network's inputs, (B, d): measured inputs, keypoints, predicted state,
+        scaled offsets.
 
         With the option `states`, return only joint state and predicted state.
         """
         config = self.config
         keypoints = [
-            encoder(self._at_size(key, batch)) for encoder, key in zip(self.encoders, self.cameras, strict=True)
+            encoder(self._at_size(key, batch))
+            for encoder, key in zip(self.encoders, self.cameras, strict=True)
         ]
         seen = torch.cat([*(batch[key] for key in self.inputs), *keypoints], dim=-1)
         parts = [seen]
@@ -171,10 +206,14 @@ class CNNPolicy(MLPPolicy):
             if self.privileged is not None:
                 n = batch[STATE].shape[1]
                 joints = (batch[STATE] - self.model.input_mean[:n]) * self.model.input_scale[:n]
-                encoded = torch.cat([joints, seen[:, n:]], dim=-1).clamp(-config.clamp, config.clamp)
+                encoded = torch.cat([joints, seen[:, n:]], dim=-1).clamp(
+                    -config.clamp, config.clamp
+                )
                 parts.append(self.privileged(encoded))
                 varies = self.truth_scale > 0
-                deviation = torch.where(varies, 1.0 / self.truth_scale, torch.zeros_like(self.truth_scale))
+                deviation = torch.where(
+                    varies, 1.0 / self.truth_scale, torch.zeros_like(self.truth_scale)
+                )
                 around = self.truth_mean + deviation * parts[1]
                 if config.states:
                     return torch.cat([batch[STATE], around], dim=-1)
@@ -183,9 +222,15 @@ class CNNPolicy(MLPPolicy):
             return torch.cat(parts, dim=-1)
 
     def _at_size(self, key: str, batch: dict[str, Tensor]) -> Tensor:
-        """Return a camera's pictures (B, 3, H, W) at the size used in training, reduced by averaging if larger."""
+        """Return a camera's pictures (B, 3, H, W) at the size used in training, reduced by
+        averaging if larger.
+        """
         size = tuple((self.config.input_features or {})[key].shape[1:])
-        return batch[key] if batch[key].shape[2:] == size else interpolate(batch[key], size, mode="area")
+        return (
+            batch[key]
+            if batch[key].shape[2:] == size
+            else interpolate(batch[key], size, mode="area")
+        )
 
     @override
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
@@ -211,7 +256,12 @@ class CNNPolicy(MLPPolicy):
         rows = torch.randint(len(self._states[0]), (DRAWS * len(errors),))
         inputs, actions = (column[rows].to(errors.device) for column in self._states)
         truth = inputs[:, -errors.shape[1] :]
-        truth += MOST_NOISE * torch.rand(len(rows), 1, device=errors.device) * self.error * torch.randn_like(truth)
+        truth += (
+            MOST_NOISE
+            * torch.rand(len(rows), 1, device=errors.device)
+            * self.error
+            * torch.randn_like(truth)
+        )
         return self.model.row_losses(inputs, actions).view(len(errors), DRAWS).mean(1)
 
     @override
@@ -222,14 +272,21 @@ class CNNPolicy(MLPPolicy):
     def _learn_statistics(self, table: Table, dataset_meta: Any) -> None:
         config = self.config
         truth = None
-        if config.aux_weight and ENVIRONMENT_STATE in table and ENVIRONMENT_STATE not in self.inputs:
+        if (
+            config.aux_weight
+            and ENVIRONMENT_STATE in table
+            and ENVIRONMENT_STATE not in self.inputs
+        ):
             truth = table[ENVIRONMENT_STATE].astype(np.float32)
         if truth is not None and not config.privileged_size:
             config.privileged_size = truth.shape[1]
             self._build_networks()
         if config.states:
             if truth is None:
-                raise UsageError("policy.states needs a dataset with observation.environment_state, and aux_weight > 0")
+                raise UsageError(
+                    "policy.states needs a dataset with observation.environment_state, and"
+                    " aux_weight > 0"
+                )
             self._learn_states(table, dataset_meta)
         else:
             super()._learn_statistics(table, dataset_meta)
@@ -241,9 +298,11 @@ class CNNPolicy(MLPPolicy):
             self.truth_scale.copy_(statistics["input_scale"])
 
     def _learn_states(self, table: Table, dataset_meta: Any) -> None:
-        """Compute the action network's statistics from joints and true state, and keep all labelled states.
+        """Compute the action network's statistics from joints and true state, and keep all labelled
+        states.
 
-        Raises `MismatchError` if the dataset of states is not of the same robot and task as that of the pictures.
+        Raises `MismatchError` if the dataset of states is not of the same robot and task as that of
+        the pictures.
         """
         states = Dataset.open(Path(self.config.states).expanduser())
         pictures = getattr(dataset_meta, "datasets", None) or [Dataset.open(dataset_meta.root)]
@@ -260,15 +319,17 @@ class CNNPolicy(MLPPolicy):
 class KeypointEncoder(nn.Module):
     """A few convolutions and a spatial softmax.
 
-    (Levine et al., End-to-end training of deep visuomotor policies, JMLR 2016, section 5.1.) Every keypoint is the
-    softmax of one channel over the picture. It yields the mean x and y, -1 to 1, with subpixel resolution, and two more
-    numbers: the deviation, which indicates the size of a thing and hence its distance, and the mean activation, which
-    says whether the thing is visible at all, as the softmax of an empty picture has a mean, too.
+    (Levine et al., End-to-end training of deep visuomotor policies, JMLR 2016, section 5.1.) Every
+    keypoint is the softmax of one channel over the picture. It yields the mean x and y, -1 to 1,
+    with subpixel resolution, and two more numbers: the deviation, which indicates the size of a
+    thing and hence its distance, and the mean activation, which says whether the thing is visible
+    at all, as the softmax of an empty picture has a mean, too.
 
-    A keypoint learns only where its softmax is large, so some must start on every small thing of a distinct colour.
-    Hence the picture is split into brightness and colour, and the weights start with variance 2 / inputs (He et al.,
-    Delving deep into rectifiers, ICCV 2015, Eq. 10). With red, green and blue and torch's own initialisation
-    every softmax began nearly uniform, and a goal of 5 pixels was not found in 1,100 steps; now 300 suffice.
+    A keypoint learns only where its softmax is large, so some must start on every small thing of a
+    distinct colour. Hence the picture is split into brightness and colour, and the weights start
+    with variance 2 / inputs (He et al., Delving deep into rectifiers, ICCV 2015, Eq. 10). With red,
+    green and blue and torch's own initialisation every softmax began nearly uniform, and a goal of
+    5 pixels was not found in 1,100 steps; now 300 suffice.
 
     channels: number in each layer; the first two layers halve the picture's sides.
     """
@@ -278,7 +339,10 @@ class KeypointEncoder(nn.Module):
         layers: list[nn.Module] = []
         for i, (inputs, outputs) in enumerate(zip((3, *channels[:-1]), channels, strict=True)):
             kernel = 5 if i == 0 else 3
-            layers += [nn.Conv2d(inputs, outputs, kernel, stride=2 if i < 2 else 1, padding=kernel // 2), nn.ReLU()]
+            layers += [
+                nn.Conv2d(inputs, outputs, kernel, stride=2 if i < 2 else 1, padding=kernel // 2),
+                nn.ReLU(),
+            ]
         self.layers = nn.Sequential(*layers)
         self.heat = nn.Conv2d(channels[-1], keypoints, 1)
         for layer in (*self.layers, self.heat):
@@ -287,9 +351,14 @@ class KeypointEncoder(nn.Module):
                 nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Return the numbers of the keypoints, (B, 4 K) in single precision, for pictures (B, 3, H, W) from 0 to 1."""
-        # Channels-last is faster on a CPU. The weights stay contiguous, as safetensors needs for an optimiser's state.
-        features = self.layers(_light_and_colour(pictures).contiguous(memory_format=torch.channels_last))
+        """Return the numbers of the keypoints, (B, 4 K) in single precision, for pictures (B, 3,
+        H, W) from 0 to 1.
+        """
+        # Channels-last is faster on a CPU. The weights stay contiguous, as safetensors needs for an
+        # optimiser's state.
+        features = self.layers(
+            _light_and_colour(pictures).contiguous(memory_format=torch.channels_last)
+        )
         # In half precision a keypoint would jump from pixel to pixel.
         with torch.autocast(pictures.device.type, enabled=False):
             return self._keypoints(features.float())
@@ -297,9 +366,11 @@ class KeypointEncoder(nn.Module):
     def _keypoints(self, features: Tensor) -> Tensor:
         """Return the numbers of the keypoints, (B, 4 K), from features (B, C, height, width)."""
         height, width = features.shape[2:]
-        # A 1 x 1 convolution as a matrix product, whose result is laid out in memory for the softmax.
-        cells = features.permute(0, 2, 3, 1).flatten(1, 2).transpose(1, 2)  # (B, C, cells), without a copy
-        heat = self.heat.weight.flatten(1) @ cells + self.heat.bias.unsqueeze(1)  # type: ignore[union-attr]
+        # A 1 x 1 convolution as a matrix product, whose result is laid out in memory for the
+        # softmax. (B, C, cells), without a copy
+        cells = features.permute(0, 2, 3, 1).flatten(1, 2).transpose(1, 2)
+        bias = self.heat.bias.unsqueeze(1)  # type: ignore[union-attr]
+        heat = self.heat.weight.flatten(1) @ cells + bias
         weights = (_SHARPNESS * heat).softmax(-1)
         moments = weights @ _places(height, width, heat.device)
         x, y = moments[..., 0], moments[..., 1]

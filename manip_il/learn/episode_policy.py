@@ -1,13 +1,15 @@
 """LeRobot policies that run many episodes at once.
 
-A LeRobot policy keeps its memory (queues of actions, past observations, ensembles) in plain attributes, one for all
-rows of a batch. Here every episode has its own copy of the policy, which shares the weights and acts alone: it plans at
-its own times, and its actions are bit-identical whatever other episodes run.
+A LeRobot policy keeps its memory (queues of actions, past observations, ensembles) in plain
+attributes, one for all rows of a batch. Here every episode has its own copy of the policy, which
+shares the weights and acts alone: it plans at its own times, and its actions are bit-identical
+whatever other episodes run.
 
-Diffusion policies are slow to plan, so episodes share calls of the network, which takes an eighth of the time per plan.
-The last bits of a row's plan depend on the number of rows and on the row's index, not on the contents of other rows.
-So every call has `ROWS` rows, and an episode's number determines its row. Plans differ by rounding from LeRobot's own,
-which are computed with a single row.
+Diffusion policies are slow to plan, so episodes share calls of the network, which takes an eighth
+of the time per plan. The last bits of a row's plan depend on the number of rows and on the row's
+index, not on the contents of other rows. So every call has `ROWS` rows, and an episode's number
+determines its row. Plans differ by rounding from LeRobot's own, which are computed with a single
+row.
 """
 
 import contextlib
@@ -27,12 +29,15 @@ from manip_il.learn.checkpoint import Checkpoint, in_one_line
 from manip_il.learn.lerobot_policy import load_policy
 
 Batch = dict[str, Any]
-ROWS = 25  # rows per call; episodes in lockstep have consecutive numbers, so each has a row to itself
+# rows per call; episodes in lockstep have consecutive numbers, so each has a row to itself
+ROWS = 25
 
 
 @dataclass
 class _Episode:
-    """An episode that runs. memory: a copy of the policy, for diffusion only its queues. seed: of this step's draws."""
+    """An episode that runs. memory: a copy of the policy, for diffusion only its queues. seed:
+    of this step's draws.
+    """
 
     number: int
     instruction: str
@@ -72,20 +77,34 @@ class EpisodePolicy:
         self._episodes: dict[int, _Episode] = {}
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> Tensor:
-        """Return one action per row, (B, n). Episodes that are not listed have ended and are forgotten."""
+        """Return one action per row, (B, n).
+
+        Episodes that are not listed have ended and are forgotten.
+        """
         before = self._episodes
-        self._episodes = {number: before.get(number) or _Episode(number, self._task) for number in episodes}
+        self._episodes = {
+            number: before.get(number) or _Episode(number, self._task) for number in episodes
+        }
         running = [self._episodes[number] for number in episodes]
         for episode in running:
             episode.begin_step()
         # mixed precision if the policy was trained with it, as in lerobot-eval
-        half = torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext()
+        half = (
+            torch.autocast(self._device.type)
+            if self.module.config.use_amp
+            else contextlib.nullcontext()
+        )
         with in_one_line("the policy cannot act"), half:
             if self.module.config.type == "diffusion":
                 actions = self._after(self._planned(self._observed(batch, running), running))
             else:
-                rows = ({key: value[i : i + 1] for key, value in batch.items()} for i in range(len(running)))
-                actions = torch.cat([self._act_alone(*pair) for pair in zip(rows, running, strict=True)])
+                rows = (
+                    {key: value[i : i + 1] for key, value in batch.items()}
+                    for i in range(len(running))
+                )
+                actions = torch.cat(
+                    [self._act_alone(*pair) for pair in zip(rows, running, strict=True)]
+                )
         return actions.to("cpu", torch.float32)
 
     def begin(self, instructions: Mapping[int, str]) -> None:
@@ -103,7 +122,9 @@ class EpisodePolicy:
         return self._before({**batch, "task": [episode.instruction for episode in episodes]})
 
     def _planned(self, observed: Batch, episodes: Sequence[_Episode]) -> Tensor:
-        """Return actions (B, n) as in `DiffusionPolicy.select_action`, row by row, still normalised."""
+        """Return actions (B, n) as in `DiffusionPolicy.select_action`, row by row, still
+        normalised.
+        """
         policy: Any = self.module
         batch = {key: value for key, value in observed.items() if isinstance(value, Tensor)}
         if images := policy.config.image_features:
@@ -140,7 +161,8 @@ class EpisodePolicy:
             for generator in generators
         ]
         seen = model._prepare_global_conditioning(batch)
-        # each row's generator also draws the noise of its denoising steps, which LeRobot's `generate_actions` cannot do
+        # each row's generator also draws the noise of its denoising steps, which LeRobot's
+        # `generate_actions` cannot do
         plans = model.conditional_sample(ROWS, seen, generators, torch.stack(noise))
         start = config.n_obs_steps - 1
         plans = plans[:, start : start + config.n_action_steps]
@@ -153,7 +175,8 @@ def _drawing(seed: int, device: torch.device) -> Iterator[None]:
     """Seed torch's global generator for a `with` block; restore its state afterwards."""
     cuda = device.type == "cuda"
     with torch.random.fork_rng(devices=[device] if cuda else []):
-        # not `torch.manual_seed`, which seeds every kind of device and takes as long as a step of a small policy
+        # not `torch.manual_seed`, which seeds every kind of device and takes as long as a step of a
+        # small policy
         torch.default_generator.manual_seed(seed)
         if cuda:
             with torch.cuda.device(device):

@@ -1,7 +1,8 @@
 """Export of a policy to one file that runs without this package: ONNX, for onnxruntime and others.
 
-Its inputs are raw observations under LeRobot's names, its outputs absolute actions. Everything between, normalisation
-and clipping too, is in the file. Its metadata say what the names, shapes and units mean.
+Its inputs are raw observations under LeRobot's names, its outputs absolute actions. Everything
+between, normalisation and clipping too, is in the file. Its metadata say what the names, shapes and
+units mean.
 """
 
 import io
@@ -27,19 +28,23 @@ from manip_il.learn.policy import LearnedPolicy
 from manip_il.mdp import F32, Images
 from manip_il.worlds.contract import GRIPPERS, OPENINGS, SERVOS, TWO_ARMS
 
-TOLERANCE = 1e-5  # largest difference between the actions of the file and of the checkpoint [rad] or [m]
+# largest difference between the actions of the file and of the checkpoint [rad] or [m]
+TOLERANCE = 1e-5
 SERVO_TOLERANCE = 1e-3  # largest difference for robots in servos' units [degrees]
 _OPSET = 17
 _ROWS = 64  # observations on which the graph is traced, and file and checkpoint are compared
-_JOINT_UNITS = {OPENINGS: ("rad", "m"), SERVOS: ("deg", "0 to 100"), TWO_ARMS: ("rad", "0 to 1")}  # (joints, grippers)
+# (joints, grippers)
+_JOINT_UNITS = {OPENINGS: ("rad", "m"), SERVOS: ("deg", "0 to 100"), TWO_ARMS: ("rad", "0 to 1")}
 _UNITS = {"x": "m", "y": "m", "z": "m", "width": "m", "tilt": "rad"}
 _UNITLESS = re.compile(r".*\.(axis_[xyz]\.[xyz]|cos[^.]*|sin[^.]*)")
 
 
 class PolicyFunction(nn.Module):
-    """A policy as a function of one observation: inputs in the order of `inputs`, absolute actions (B, n) as output.
+    """A policy as a function of one observation: inputs in the order of `inputs`, absolute actions
+    (B, n) as output.
 
-    Joint state (B, n) and environment state (B, k) are float32, pictures uint8 (B, H, W, 3), as cameras give them.
+    Joint state (B, n) and environment state (B, k) are float32, pictures uint8 (B, H, W, 3), as
+    cameras give them.
     """
 
     def __init__(self, policy: LearnedPolicy) -> None:
@@ -61,10 +66,11 @@ class PolicyFunction(nn.Module):
 
 
 def export_onnx(checkpoint: Checkpoint | Path) -> tuple[bytes, float]:
-    """Return a policy, or that in a `pretrained_model` folder, as ONNX, and the largest change of an action by that.
+    """Return a policy, or that in a `pretrained_model` folder, as ONNX, and the largest change of
+    an action by that.
 
-    Raises `ManipError` for a policy that cannot be exported or whose file would act differently from the checkpoint,
-    and what `LearnedPolicy.load` raises.
+    Raises `ManipError` for a policy that cannot be exported or whose file would act differently
+    from the checkpoint, and what `LearnedPolicy.load` raises.
     """
     import onnx
     import onnxruntime
@@ -74,7 +80,8 @@ def export_onnx(checkpoint: Checkpoint | Path) -> tuple[bytes, float]:
     path, meta = checkpoint.path, checkpoint.origin
     if checkpoint.space == EE_DELTA:
         raise ManipError(
-            f"{path} was trained with {EE_DELTA}, whose inverse kinematics cannot be exported; train with {JOINT_DELTA}"
+            f"{path} was trained with {EE_DELTA}, whose inverse kinematics cannot be exported;"
+            f" train with {JOINT_DELTA}"
         )
     function = PolicyFunction(policy)
     states, around, images = _random_observations(function.network, checkpoint)
@@ -106,14 +113,16 @@ def export_onnx(checkpoint: Checkpoint | Path) -> tuple[bytes, float]:
     tolerance = SERVO_TOLERANCE if meta and meta.action_meaning == SERVOS else TOLERANCE
     if not difference <= tolerance:
         raise ManipError(
-            f"{path}: the exported file's actions differ by up to {difference:.2g} from the checkpoint's; expected at "
-            f"most {tolerance:g}, so nothing was written"
+            f"{path}: the exported file's actions differ by up to {difference:.2g} from the"
+            f" checkpoint's; expected at most {tolerance:g}, so nothing was written"
         )
     return data, difference
 
 
 def metadata(checkpoint: Checkpoint, inputs: Sequence[str]) -> dict[str, str]:
-    """Return the ONNX file's metadata: policy, inputs and outputs, and, if known, robot and task."""
+    """Return the ONNX file's metadata: policy, inputs and outputs, and, if known, robot and
+    task.
+    """
     origin = checkpoint.origin
     entries: dict[str, Any] = {
         "inputs": [_entry(checkpoint, key) for key in inputs],
@@ -123,16 +132,31 @@ def metadata(checkpoint: Checkpoint, inputs: Sequence[str]) -> dict[str, str]:
         "policy_sha256": checkpoint.sha256,
     }
     if origin is not None:
-        entries |= {"robot": origin.robot, "task": origin.task, "action_meaning": origin.action_meaning}
+        entries |= {
+            "robot": origin.robot,
+            "task": origin.task,
+            "action_meaning": origin.action_meaning,
+        }
         entries["control_rate_hz"] = origin.fps
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in entries.items()}
+    return {
+        key: value if isinstance(value, str) else json.dumps(value)
+        for key, value in entries.items()
+    }
 
 
 def _entry(checkpoint: Checkpoint, key: str) -> dict[str, Any]:
-    """Return the name, type and shape of an input or output, and what its numbers mean, if known."""
+    """Return the name, type and shape of an input or output, and what its numbers mean, if
+    known.
+    """
     if key.startswith(IMAGES):
         shape = ["batch", *checkpoint.pictures[key.removeprefix(IMAGES)], 3]
-        return {"name": key, "dtype": "uint8", "shape": shape, "names": ["red", "green", "blue"], "units": "0 to 255"}
+        return {
+            "name": key,
+            "dtype": "uint8",
+            "shape": shape,
+            "names": ["red", "green", "blue"],
+            "units": "0 to 255",
+        }
     size = checkpoint.action if key == ACTION else checkpoint.numbers[key]
     entry = {"name": key, "dtype": "float32", "shape": ["batch", size]}
     origin = checkpoint.origin
@@ -140,7 +164,10 @@ def _entry(checkpoint: Checkpoint, key: str) -> dict[str, Any]:
         return entry
     if key == ENVIRONMENT_STATE:
         names = list(origin.environment_state_names)
-        units = ["1" if _UNITLESS.fullmatch(name) else _UNITS.get(name.rpartition(".")[2]) for name in names]
+        units = [
+            "1" if _UNITLESS.fullmatch(name) else _UNITS.get(name.rpartition(".")[2])
+            for name in names
+        ]
         return entry | {"names": names, "units": units}
     entry["names"] = list(origin.joint_names)
     meaning = origin.action_meaning

@@ -1,4 +1,7 @@
-"""The options of a fit, by LeRobot's names. Imports neither torch nor LeRobot, so that help is fast."""
+"""The options of a fit, by LeRobot's names.
+
+Imports neither torch nor LeRobot, so that help is fast.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,8 @@ class Defaults(NamedTuple):
 
 ActionSpace = Literal["joint_target", "joint_delta", "ee_delta"]
 LEROBOT = Defaults(100_000, 8, 20_000)
-DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), CNN: Defaults(15_000, 32, 1_000)}  # where these differ from LeRobot's
+# where these differ from LeRobot's
+DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), CNN: Defaults(15_000, 32, 1_000)}
 
 
 def _by_default(name: str) -> str:
@@ -39,48 +43,70 @@ def _by_default(name: str) -> str:
 class FitConfig:
     """Options of a fit; None stands for the default of the policy's type.
 
-    policy: `type` or `path`, and the options of that policy (`loss`, `width`, `chunk_size`, ...). action_space: see
-    `manip_il.learn.action_spaces`; by default that of the initial checkpoint, if there is one. threads: with a second
-    thread a fit is up to 1.8 times as fast if a core is free, and tens of times slower if none is. trust: whether
-    models that the policy or its checkpoint names may be loaded. seed: for weights and batches. init_from: a
-    `pretrained_model` folder with the initial weights.
+    policy: `type` or `path`, and the options of that policy (`loss`, `width`, `chunk_size`, ...).
+    action_space: see `manip_il.learn.action_spaces`; by default that of the initial checkpoint, if
+    there is one. threads: with a second thread a fit is up to 1.8 times as fast if a core is free,
+    and tens of times slower if none is. trust: whether models that the policy or its checkpoint
+    names may be loaded. seed: for weights and batches. init_from: a `pretrained_model` folder with
+    the initial weights.
 
     Raises `UsageError` for a number out of range, and for options that do not go together.
     """
 
     policy: Mapping[str, Any] = option(
         dict,
-        "an option of the policy: type (mlp, cnn or one of LeRobot's), path (a policy to start from), or any option "
-        "that --policy.type=TYPE --help lists",
+        "an option of the policy: type (mlp, cnn or one of LeRobot's), path (a policy to start"
+        " from), or any option that --policy.type=TYPE --help lists",
     )
     action_space: ActionSpace | None = option(
-        None, "what the policy learns to predict; by default joint_delta for mlp and cnn, else joint_target"
+        None,
+        "what the policy learns to predict; by default joint_delta for mlp and cnn, else"
+        " joint_target",
     )
     observation: Literal["state", "images", "both"] | None = option(
-        None, "what the policy observes in addition to the joints; by default images for cnn, else state"
+        None,
+        "what the policy observes in addition to the joints; by default images for cnn, else state",
     )
-    steps: int | None = option(None, f"gradient steps; {_by_default('steps')}", grows=True, at_least=1)
-    batch_size: int | None = option(None, f"frames per step; {_by_default('batch_size')}", at_least=1)
-    lr: float | None = option(None, "peak learning rate; by default the policy's own", at_least=1e-15)
+    steps: int | None = option(
+        None, f"gradient steps; {_by_default('steps')}", grows=True, at_least=1
+    )
+    batch_size: int | None = option(
+        None, f"frames per step; {_by_default('batch_size')}", at_least=1
+    )
+    lr: float | None = option(
+        None, "peak learning rate; by default the policy's own", at_least=1e-15
+    )
     optimizer: Mapping[str, Any] = option(
-        dict, "an option of an optimiser that replaces the policy's own: type (adamw, ...), weight_decay, ..."
+        dict,
+        "an option of an optimiser that replaces the policy's own: type (adamw, ...),"
+        " weight_decay, ...",
     )
     scheduler: Mapping[str, Any] = option(
         dict, "an option of a learning-rate schedule that replaces the policy's own: type, ..."
     )
     eval_split: float = option(
-        0.05, "share of the episodes held out for val_loss", flag="dataset.eval_split", at_least=0, at_most=0.99
+        0.05,
+        "share of the episodes held out for val_loss",
+        flag="dataset.eval_split",
+        at_least=0,
+        at_most=0.99,
     )
     image_augment: bool | None = option(
         None, "random crops and colour jitter during training; by default on, except for cnn"
     )
-    threads: int = option(1, "PyTorch threads; more than one helps only if cores are idle", free=True, at_least=1)
+    threads: int = option(
+        1, "PyTorch threads; more than one helps only if cores are idle", free=True, at_least=1
+    )
     save_freq: int | None = option(
         None, f"steps between checkpoints; {_by_default('save_freq')}", free=True, at_least=1
     )
     log_freq: int = option(200, "steps between metrics", free=True, at_least=1)
-    tensorboard: bool = option(False, "write curves for TensorBoard to OUTPUT_DIR/tensorboard", free=True)
-    wandb: Mapping[str, Any] = option(dict, "an option of Weights & Biases: enable, project, mode, ...", free=True)
+    tensorboard: bool = option(
+        False, "write curves for TensorBoard to OUTPUT_DIR/tensorboard", free=True
+    )
+    wandb: Mapping[str, Any] = option(
+        dict, "an option of Weights & Biases: enable, project, mode, ...", free=True
+    )
     trust: bool = False
     seed: int = 0
     init_from: Path | None = None
@@ -89,11 +115,13 @@ class FitConfig:
         check_bounds(self)
         if "path" in self.policy and "type" in self.policy:
             raise UsageError(
-                "--policy.path and --policy.type exclude each other: a checkpoint has its own type; give one of them"
+                "--policy.path and --policy.type exclude each other: a checkpoint has its own type;"
+                " give one of them"
             )
         if self.kind == MLP and self.takes_images:
             raise UsageError(
-                f"--observation={self.observes} needs a policy that takes images, unlike mlp; use --policy.type=cnn"
+                f"--observation={self.observes} needs a policy that takes images, unlike mlp; use"
+                " --policy.type=cnn"
             )
 
     @cached_property
@@ -103,7 +131,10 @@ class FitConfig:
 
     @cached_property
     def initial(self) -> Checkpoint | None:
-        """The checkpoint with the initial weights, in `policy.path` or `init_from`. Raises what `start` raises."""
+        """The checkpoint with the initial weights, in `policy.path` or `init_from`.
+
+        Raises what `start` raises.
+        """
         return self.start if self.init_from is None else _open(self.init_from)
 
     @property
@@ -113,8 +144,12 @@ class FitConfig:
 
     @property
     def observes(self) -> str:
-        """The requested member of `OBSERVATIONS`, else the checkpoint's, else images for cnn, else state."""
-        return self.observation or (self.start.observation if self.start else "images" if self.kind == CNN else "state")
+        """The requested member of `OBSERVATIONS`, else the checkpoint's, else images for cnn,
+        else state.
+        """
+        return self.observation or (
+            self.start.observation if self.start else "images" if self.kind == CNN else "state"
+        )
 
     @property
     def takes_images(self) -> bool:
@@ -128,7 +163,10 @@ class FitConfig:
 
     @property
     def augments(self) -> bool:
-        """Whether pictures are randomly changed; by default not for cnn, as crops hide where things are."""
+        """Whether pictures are randomly changed.
+
+        By default not for cnn, as crops hide where things are.
+        """
         return self.kind != CNN if self.image_augment is None else self.image_augment
 
     @property

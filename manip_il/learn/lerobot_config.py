@@ -27,7 +27,8 @@ from manip_il.learn.network import require_device
 from manip_il.worlds.contract import JOINT_TARGETS, OPENINGS
 
 PLUGINS = ("manip_il.learn.mlp", "manip_il.learn.cnn")
-# Options of LeRobot's policies that concern its Hub, its commands or one machine, and one without effect.
+# Options of LeRobot's policies that concern its Hub, its commands or one machine, and one without
+# effect.
 NOT_OURS = (
     *("push_to_hub", "repo_id", "private", "pretrained_path", "pretrained_revision", "use_peft"),
     "heatmap_weight",
@@ -56,10 +57,12 @@ def _registered(base: type[Any], kind: Any, what: str) -> Any:
 
 
 def policy_config(fit: FitConfig) -> PreTrainedConfig:
-    """Return the policy configuration of a fit: new, or that of the initial checkpoint with changes.
+    """Return the policy configuration of a fit: new, or that of the initial checkpoint with
+    changes.
 
-    The device is the GPU if there is one. Raises `UnknownName` for an unknown type or option, `UsageError` for a value
-    that LeRobot refuses, `ManipError` if it names models that are not trusted.
+    The device is the GPU if there is one. Raises `UnknownName` for an unknown type or option,
+    `UsageError` for a value that LeRobot refuses, `ManipError` if it names models that are not
+    trusted.
     """
     cls = policy_class(fit.kind)
     source, saved = f"--policy.type={fit.kind}", dict[str, Any]()
@@ -69,36 +72,53 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
     if fit.start is not None:
         source = f"--policy.path={fit.start.path}"
         saved = {name: value for name, value in fit.start.options.items() if name not in NOT_OURS}
-        if saved.get("states") and "states" not in given:  # a dataset's path, which only the user may name
-            raise UsageError(f"{source} learnt from a dataset of states; give it again with --policy.states=DATASET")
+        # a dataset's path, which only the user may name
+        if saved.get("states") and "states" not in given:
+            raise UsageError(
+                f"{source} learnt from a dataset of states; give it again with"
+                " --policy.states=DATASET"
+            )
     options = saved | given
     require_trust({**options, "type": fit.kind}, source, fit.trust)
     config = typing.cast(PreTrainedConfig, decode(cls, options, source))
-    config.push_to_hub = False  # LeRobot uploads by default; nothing leaves this machine unless asked to
+    # LeRobot uploads by default; nothing leaves this machine unless asked to
+    config.push_to_hub = False
     start = fit.init_from or (fit.start.path if fit.start else None)
     config.pretrained_path = None if start is None else Path(start)
     return config
 
 
 def choice(base: type[Any], settings: Mapping[str, Any], group: str) -> Any:
-    """Return the configuration (of an optimiser, a schedule, ...) that `base` registers as `settings["type"]`."""
+    """Return the configuration (of an optimiser, a schedule, ...) that `base` registers as
+    `settings["type"]`.
+    """
     own = {name: value for name, value in settings.items() if name != "type"}
     cls = _registered(base, settings.get("type"), f"--{group}.type")
     return decode(cls, own, f"--{group}.type={settings.get('type')}")
 
 
 def decode(cls: type[Any], settings: Mapping[str, Any], source: str) -> Any:
-    """Return a LeRobot dataclass built from `settings`. source: where these come from, for messages.
+    """Return a LeRobot dataclass built from `settings`. source: where these come from, for
+    messages.
 
     Raises `UnknownName` for an unknown option, `UsageError` for a value that LeRobot refuses.
     """
-    known = [field.name for field in dataclasses.fields(cls) if field.init and field.name not in NOT_OURS]
+    known = [
+        field.name for field in dataclasses.fields(cls) if field.init and field.name not in NOT_OURS
+    ]
     for name in settings:
         if name not in known:
             raise UnknownName(f"option of {source}:", name, known)
     try:
         return draccus.decode(cls, dict(settings))
-    except (DecodingError, ParsingError, ValueError, TypeError, NotImplementedError, ImportError) as error:
+    except (
+        DecodingError,
+        ParsingError,
+        ValueError,
+        TypeError,
+        NotImplementedError,
+        ImportError,
+    ) as error:
         reason = error if isinstance(error, DecodingError) else error.__cause__ or error
         raise UsageError(f"{source}: {' '.join(str(reason).split())}") from error
 
@@ -110,7 +130,11 @@ def option_lines(kind: str) -> list[tuple[str, str]]:
         if not field.init or field.name in (*NOT_OURS, "input_features", "output_features"):
             continue
         missing = field.default is dataclasses.MISSING
-        default = field.default_factory() if missing and callable(field.default_factory) else field.default
+        default = (
+            field.default_factory()
+            if missing and callable(field.default_factory)
+            else field.default
+        )
         typed = json.dumps(draccus.encode(default)).replace('"', "")  # as a user would type it
         rows.append((f"--policy.{field.name}", typed))
     return rows
@@ -124,18 +148,24 @@ def policy_features(
     Pictures, (H, W, 3) in `info.json`, are (3, H, W) for a policy.
     """
     typed = dataset_to_policy_features({key: features[key] for key in (*inputs, ACTION)})
-    typed = {key: PolicyFeature(feature.type, tuple(feature.shape)) for key, feature in typed.items()}
+    typed = {
+        key: PolicyFeature(feature.type, tuple(feature.shape)) for key, feature in typed.items()
+    }
     return {key: typed[key] for key in inputs}, {ACTION: typed[ACTION]}
 
 
 def set_features(
-    policy: PreTrainedConfig, features: Mapping[str, dict[str, Any]], inputs: Sequence[str], observation: str
+    policy: PreTrainedConfig,
+    features: Mapping[str, dict[str, Any]],
+    inputs: Sequence[str],
+    observation: str,
 ) -> None:
     """Set a policy's inputs and outputs from a dataset's features.
 
-    By default LeRobot's state-based policies leave `observation.environment_state` in its raw units; here it is
-    normalised like the joint state. They refuse the joints alone, which get an environment state of no numbers, see
-    `JointsAloneStep`. Raises `ManipError` for features that the policy refuses.
+    By default LeRobot's state-based policies leave `observation.environment_state` in its raw
+    units; here it is normalised like the joint state. They refuse the joints alone, which get an
+    environment state of no numbers, see `JointsAloneStep`. Raises `ManipError` for features that
+    the policy refuses.
     """
     policy.input_features, policy.output_features = policy_features(features, inputs)
     if list(inputs) == [STATE] and policy.type not in OWN_SPACE:
@@ -146,20 +176,30 @@ def set_features(
     try:
         policy.validate_features()
     except ValueError as error:
-        raise ManipError(f"--policy.type={policy.type} with --observation={observation}: {error}") from error
+        raise ManipError(
+            f"--policy.type={policy.type} with --observation={observation}: {error}"
+        ) from error
 
 
-def lerobot_options(fit: FitConfig, action_meaning: str = OPENINGS) -> tuple[TrainPipelineConfig, str]:
-    """Return a fit's options in LeRobot's form (policy, optimiser, schedule, logger, ...), and its action space.
+def lerobot_options(
+    fit: FitConfig, action_meaning: str = OPENINGS
+) -> tuple[TrainPipelineConfig, str]:
+    """Return a fit's options in LeRobot's form (policy, optimiser, schedule, logger, ...), and its
+    action space.
 
-    LeRobot writes these as `train_config.json`, apart from the dataset and the folder, which are not known yet.
-    action_meaning: as in the dataset; actions other than joint targets are by default learnt unchanged. Raises what
-    `policy_config` raises, `UnknownName` or `UsageError` for an optimiser, a schedule or a logger that LeRobot does not
-    know, `MismatchError` for an initial checkpoint with another action space.
+    LeRobot writes these as `train_config.json`, apart from the dataset and the folder, which are
+    not known yet. action_meaning: as in the dataset; actions other than joint targets are by
+    default learnt unchanged. Raises what `policy_config` raises, `UnknownName` or `UsageError` for
+    an optimiser, a schedule or a logger that LeRobot does not know, `MismatchError` for an initial
+    checkpoint with another action space.
     """
     policy = policy_config(fit)
     space = _action_space(policy, fit, action_meaning)
-    optimizer = choice(OptimizerConfig, fit.optimizer, "optimizer") if fit.optimizer else policy.get_optimizer_preset()
+    optimizer = (
+        choice(OptimizerConfig, fit.optimizer, "optimizer")
+        if fit.optimizer
+        else policy.get_optimizer_preset()
+    )
     if fit.lr is not None:
         optimizer.lr = fit.lr
     pipeline = TrainPipelineConfig(
@@ -173,9 +213,11 @@ def lerobot_options(fit: FitConfig, action_meaning: str = OPENINGS) -> tuple[Tra
         log_freq=fit.log_freq,
         save_freq=fit.save_freq or fit.defaults.save_freq,
         optimizer=optimizer,
-        scheduler=choice(LRSchedulerConfig, fit.scheduler, "scheduler")
-        if fit.scheduler
-        else policy.get_scheduler_preset(),
+        scheduler=(
+            choice(LRSchedulerConfig, fit.scheduler, "scheduler")
+            if fit.scheduler
+            else policy.get_scheduler_preset()
+        ),
         wandb=decode(WandBConfig, fit.wandb, "--wandb"),
     )
     return pipeline, space
@@ -189,10 +231,13 @@ def _action_space(policy: PreTrainedConfig, fit: FitConfig, meaning: str) -> str
     start = fit.initial
     space = wanted or getattr(policy, "action_space", start.space if start else JOINT_TARGET)
     if start is not None and start.space != space:
-        raise MismatchError("action space", f"the checkpoint {start.path}", start.space, "this fit", space)
+        raise MismatchError(
+            "action space", f"the checkpoint {start.path}", start.space, "this fit", space
+        )
     if space != JOINT_TARGET and policy.type not in CONVERTED:
         raise UsageError(
-            f"action_space is {space!r}, which --policy.type={policy.type} does not support; expected {JOINT_TARGET}, "
-            f"or --policy.type={', '.join(CONVERTED[:-1])} or {CONVERTED[-1]}"
+            f"action_space is {space!r}, which --policy.type={policy.type} does not support;"
+            f" expected {JOINT_TARGET}, or --policy.type={', '.join(CONVERTED[:-1])} or"
+            f" {CONVERTED[-1]}"
         )
     return space

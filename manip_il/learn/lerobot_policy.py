@@ -15,21 +15,26 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 
 from manip_il.data.schema import IMAGES
 from manip_il.learn.action_spaces import Conversion
-from manip_il.learn.action_steps import JointsAloneStep, add_steps  # importing it registers our steps for loading
+
+# importing it registers our steps for loading
+from manip_il.learn.action_steps import JointsAloneStep, add_steps
 from manip_il.learn.checkpoint import MEASURED, PROCESSORS, Checkpoint, in_one_line
 from manip_il.learn.lerobot_config import policy_class
 from manip_il.learn.names import CNN, MLP
 from manip_il.learn.network import warm_start
 
 _DEVICE_STEP = "device_processor"
-_SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less variation than this in all of the data is noise
+# [rad] or [m]: less variation than this in all of the data is noise
+_SMALLEST = {"std": 1e-3, "range": 1e-2}
 
 
-def build_policy(config: PreTrainedConfig, meta: Any, resumed: Checkpoint | None = None) -> PreTrainedPolicy:
+def build_policy(
+    config: PreTrainedConfig, meta: Any, resumed: Checkpoint | None = None
+) -> PreTrainedPolicy:
     """Return a LeRobot policy for training.
 
-    An mlp that starts from another mlp's weights takes input statistics from the new data, see `warm_start`; a cnn
-    takes the range of its actions from the new data.
+    An mlp that starts from another mlp's weights takes input statistics from the new data, see
+    `warm_start`; a cnn takes the range of its actions from the new data.
 
     Args:
         config: The policy's options. The weights are those in its `pretrained_path`, else new.
@@ -62,12 +67,17 @@ def build_policy(config: PreTrainedConfig, meta: Any, resumed: Checkpoint | None
     return policy
 
 
-def build_processors(config: PreTrainedConfig, meta: Any, conversion: Conversion | None = None) -> tuple[Any, Any]:
+def build_processors(
+    config: PreTrainedConfig, meta: Any, conversion: Conversion | None = None
+) -> tuple[Any, Any]:
     """Return new LeRobot pre- and postprocessors with the dataset's statistics.
 
-    conversion: added to the processors, if given; the statistics must then be those of the converted actions.
+    conversion: added to the processors, if given; the statistics must then be those of the
+    converted actions.
     """
-    before, after = make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
+    before, after = make_pre_post_processors(
+        config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta
+    )
     if conversion is not None:
         add_steps(before, after, conversion)
     if config.env_state_feature is not None and not all(config.env_state_feature.shape):
@@ -78,13 +88,17 @@ def build_processors(config: PreTrainedConfig, meta: Any, conversion: Conversion
 def load_processors(
     checkpoint: Checkpoint, config: PreTrainedConfig, *, trust: bool = False, learns: bool = False
 ) -> tuple[Any, Any]:
-    """Return the processors of a checkpoint, on the configuration's device. learns: whether a fit continues from it.
+    """Return the processors of a checkpoint, on the configuration's device. learns: whether a fit
+    continues from it.
 
     Raises what `Checkpoint.require_trust` and LeRobot raise.
     """
     checkpoint.require_trust(trust)
     names = [step["registry_name"] for step in checkpoint.processors.get(PROCESSORS[0], ())]
-    overrides = {_DEVICE_STEP: {"device": config.device}, **({MEASURED: {"converted": True}} if learns else {})}
+    overrides = {
+        _DEVICE_STEP: {"device": config.device},
+        **({MEASURED: {"converted": True}} if learns else {}),
+    }
     kept = {name: values for name, values in overrides.items() if name in names}
     return make_pre_post_processors(config, str(checkpoint.path), preprocessor_overrides=kept)
 
@@ -92,7 +106,8 @@ def load_processors(
 def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return a dataset's statistics with lower bounds on the deviations and ranges of vectors.
 
-    Otherwise a joint that hardly moved in the data would be many deviations off as soon as it moves.
+    Otherwise a joint that hardly moved in the data would be many deviations off as soon as it
+    moves.
     """
     usable: dict[str, dict[str, Any]] = {}
     for key, values in stats.items():
@@ -106,11 +121,15 @@ def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
     return usable
 
 
-def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tuple[PreTrainedPolicy, Any, Any]:
-    """Return the policy of a checkpoint and its processors; downloads only what a trusted policy names.
+def load_policy(
+    checkpoint: Checkpoint, device: str, trust: bool = False
+) -> tuple[PreTrainedPolicy, Any, Any]:
+    """Return the policy of a checkpoint and its processors.
 
-    Raises `UnknownName` for an unknown type, `ManipError` if packages are missing, if the policy names models that are
-    not trusted, or if LeRobot cannot load the folder.
+    Downloads only what a trusted policy names.
+
+    Raises `UnknownName` for an unknown type, `ManipError` if packages are missing, if the policy
+    names models that are not trusted, or if LeRobot cannot load the folder.
     """
     cls = policy_class(checkpoint.kind)
     checkpoint.require_trust(trust)
@@ -118,13 +137,19 @@ def load_policy(checkpoint: Checkpoint, device: str, trust: bool = False) -> tup
         # not `PreTrainedConfig.from_pretrained`, which leaves a temporary file behind each time
         config = draccus.decode(cls, checkpoint.options | {"device": device})
         processors = load_processors(checkpoint, config, trust=trust)
-        policy = get_policy_class(checkpoint.kind).from_pretrained(checkpoint.path, config=config, strict=True)
+        policy = get_policy_class(checkpoint.kind).from_pretrained(
+            checkpoint.path, config=config, strict=True
+        )
         return policy, *processors
 
 
 @contextlib.contextmanager
 def _lerobot(what: str) -> Iterator[None]:
-    """Like `in_one_line`; also drops what LeRobot prints, as standard output belongs to the caller."""
+    """Like `in_one_line`.
+
+    Also drops what LeRobot prints, as standard output belongs to the caller.
+    """
     with in_one_line(what), contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Initializing zero-element tensors")  # of policies that see only joints
+        # of policies that see only joints
+        warnings.filterwarnings("ignore", "Initializing zero-element tensors")
         yield

@@ -52,7 +52,10 @@ class MSEHead(Head):
 
 
 class L1Head(MSEHead):
-    """Mean absolute error: a Laplace distribution with unit scale, up to constants. Acts with its median."""
+    """Mean absolute error: a Laplace distribution with unit scale, up to constants.
+
+    Acts with its median.
+    """
 
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
@@ -60,7 +63,9 @@ class L1Head(MSEHead):
 
 
 class GaussianHead(Head, nn.Module):
-    """Diagonal Gaussian: the network gives the mean; one log-deviation per dimension is learnt. Acts with the mean.
+    """Diagonal Gaussian: the network gives the mean; one log-deviation per dimension is learnt.
+
+    Acts with the mean.
 
     The deviation does not depend on the state. If it did, easy states would outweigh hard ones by
     orders of magnitude in the mean's gradient and the mean would underfit (Seitzer et al., On the
@@ -119,8 +124,8 @@ class CategoricalHead(Head):
     at the end of the range would be pulled inwards. The expectation over the bin centres is the
     target. With a sigma of 0 there is no padding, and nearly all of a target is in the nearest bin.
 
-    Acts with the expectation over the likeliest bin and the max(1, `pad`) bins on either side of it:
-    exact within a bin, unlike the argmax, and never between two separate modes, unlike the
+    Acts with the expectation over the likeliest bin and the max(1, `pad`) bins on either side of
+    it: exact within a bin, unlike the argmax, and never between two separate modes, unlike the
     expectation over all bins.
     """
 
@@ -137,7 +142,9 @@ class CategoricalHead(Head):
         return -(self.smeared(target) * self._logits(params).log_softmax(-1)).sum((-2, -1))
 
     def smeared(self, target: Tensor) -> Tensor:
-        """Return the share of each target (B, n) in each bin, (B, n, bins + 2 pad), under its Gaussian."""
+        """Return the share of each target (B, n) in each bin, (B, n, bins + 2 pad), under its
+        Gaussian.
+        """
         # targets, clamped to the data's range, in bins from the first centre
         place = (target.clamp(-1.0, 1.0) + 1.0) * (0.5 * (self.bins - 1)) + self.pad
         edges = torch.arange(self.total + 1, dtype=target.dtype, device=target.device) - 0.5
@@ -148,7 +155,9 @@ class CategoricalHead(Head):
     @override
     def action(self, params: Tensor) -> Tensor:
         logits, reach = self._logits(params), max(1, self.pad)
-        near = logits.argmax(-1, keepdim=True) + torch.arange(-reach, reach + 1, device=params.device)
+        near = logits.argmax(-1, keepdim=True) + torch.arange(
+            -reach, reach + 1, device=params.device
+        )
         inside = (near >= 0) & (near < self.total)
         near = near.clamp(0, self.total - 1)
         weights = logits.gather(-1, near).masked_fill(~inside, -torch.inf).softmax(-1)
@@ -180,7 +189,9 @@ def make_head(loss: str, n: int, *, components: int, bins: int, sigma: float) ->
 
 
 def floored_log_std(raw: Tensor) -> Tensor:
-    """Return log-deviations of the shape of `raw`, (B, n), smoothly bounded below by `MIN_LOG_STD`."""
+    """Return log-deviations of the shape of `raw`, (B, n), smoothly bounded below by
+    `MIN_LOG_STD`.
+    """
     return MIN_LOG_STD + softplus(raw - MIN_LOG_STD)
 
 

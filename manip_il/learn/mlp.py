@@ -1,7 +1,7 @@
 """The `mlp` policy in LeRobot's form: its options, its policy class and its processors.
 
-LeRobot expects all three in the module of the options class. A LeRobot plugin must be a package, for
-`--policy.discover_packages_path=manip_il.learn.mlp`: hence `__path__`.
+LeRobot expects all three in the module of the options class. A LeRobot plugin must be a package,
+for `--policy.discover_packages_path=manip_il.learn.mlp`: hence `__path__`.
 """
 
 import math
@@ -42,7 +42,9 @@ class WarmUpAndCosineConfig(LRSchedulerConfig):
         def share(step: int) -> float:
             if step < warmup:
                 return (step + 1) / (warmup + 1)
-            return 0.5 * (1.0 + math.cos(math.pi * (step - warmup) / max(1, num_training_steps - warmup)))
+            return 0.5 * (
+                1.0 + math.cos(math.pi * (step - warmup) / max(1, num_training_steps - warmup))
+            )
 
         return LambdaLR(optimizer, share)
 
@@ -50,7 +52,9 @@ class WarmUpAndCosineConfig(LRSchedulerConfig):
 @PreTrainedConfig.register_subclass("mlp")
 @dataclass
 class MLPConfig(NetworkConfig, PreTrainedConfig):
-    """A multi-layer perceptron from joint and environment state to one action; its options are those of its network.
+    """A multi-layer perceptron from joint and environment state to one action.
+
+    Its options are those of its network.
 
     The network needs raw inputs (its targets may be relative to the measured joints), so LeRobot's
     normaliser steps are the identity and the statistics are buffers of the model.
@@ -59,13 +63,17 @@ class MLPConfig(NetworkConfig, PreTrainedConfig):
     device: str | None = "cpu"
     push_to_hub: bool = False  # type: ignore[assignment]
     normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict.fromkeys(("STATE", "ENV", "VISUAL", "ACTION"), NormalizationMode.IDENTITY)
+        default_factory=lambda: dict.fromkeys(
+            ("STATE", "ENV", "VISUAL", "ACTION"), NormalizationMode.IDENTITY
+        )
     )
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
     scheduler_warmup_steps: int = 100
 
-    observation_delta_indices = action_delta_indices = reward_delta_indices = None  # type: ignore[assignment]
+    observation_delta_indices = None  # type: ignore[assignment]
+    action_delta_indices = None  # type: ignore[assignment]
+    reward_delta_indices = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         PreTrainedConfig.__post_init__(self)
@@ -78,8 +86,8 @@ class MLPConfig(NetworkConfig, PreTrainedConfig):
         shapes = [None if feature is None else feature.shape for feature in (state, action)]
         if shapes[0] is None or len(shapes[0]) != 1 or shapes[0] != shapes[1]:
             raise UsageError(
-                f"the {self.type} policy needs observation.state and action of the same size; their shapes are "
-                f"{shapes[0]} and {shapes[1]}"
+                f"the {self.type} policy needs observation.state and action of the same size; their"
+                f" shapes are {shapes[0]} and {shapes[1]}"
             )
 
     @override
@@ -94,13 +102,13 @@ class MLPConfig(NetworkConfig, PreTrainedConfig):
 class MLPPolicy(PreTrainedPolicy):
     """LeRobot's policy interface to `MLPNetwork`.
 
-    Batches hold `observation.state` (B, n), `observation.environment_state` (B, k) and, in training,
-    `action` (B, n), all raw ([rad], [m]).
+    Batches hold `observation.state` (B, n), `observation.environment_state` (B, k) and, in
+    training, `action` (B, n), all raw ([rad], [m]).
 
     Args:
         config: The options, with features.
-        dataset_meta: For training, LeRobot's metadata, which `make_policy` passes on; see `training_table`.
-            The statistics are then computed from the frames with a valid label.
+        dataset_meta: For training, LeRobot's metadata, which `make_policy` passes on; see
+            `training_table`. The statistics are then computed from the frames with a valid label.
     """
 
     config_class = MLPConfig  # type: ignore[assignment]
@@ -110,7 +118,9 @@ class MLPPolicy(PreTrainedPolicy):
     def __init__(self, config: MLPConfig, dataset_meta: Any = None, **_: Any) -> None:
         super().__init__(config)
         config.validate_features()
-        self.inputs = [key for key in (STATE, ENVIRONMENT_STATE) if key in (config.input_features or {})]
+        self.inputs = [
+            key for key in (STATE, ENVIRONMENT_STATE) if key in (config.input_features or {})
+        ]
         if config.scales and not config.scaled and dataset_meta is not None:
             reads = ENVIRONMENT_STATE in self.inputs or getattr(config, "aux_weight", 0) > 0
             config.scaled = self._offsets(offsets_of(dataset_meta.features if reads else {}))
@@ -127,7 +137,9 @@ class MLPPolicy(PreTrainedPolicy):
 
     @override
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """Return one action per row, (B, n): absolute, except for `ee_delta`, where it is the motion of the hand."""
+        """Return one action per row, (B, n): absolute, except for `ee_delta`, where it is the
+        motion of the hand.
+        """
         return self.model.act(self.network_inputs(batch))
 
     @override
@@ -170,35 +182,48 @@ class MLPPolicy(PreTrainedPolicy):
 def training_table(config: MLPConfig, dataset_meta: Any) -> Table:
     """Return the columns of the training data, (N, d) each.
 
-    `manip-il train` has read them already (`dataset_meta.table`); for `lerobot-train` they are read here. Raises
-    `ManipError` for an action space that only `manip-il train` converts to.
+    `manip-il train` has read them already (`dataset_meta.table`); for `lerobot-train` they are read
+    here. Raises `ManipError` for an action space that only `manip-il train` converts to.
     """
     if (table := getattr(dataset_meta, "table", None)) is not None:
         return table
     if config.action_space == EE_DELTA:
         raise ManipError(
-            f"{EE_DELTA} needs the robot's kinematics, which LeRobot does not have; train with manip-il train"
+            f"{EE_DELTA} needs the robot's kinematics, which LeRobot does not have; train with"
+            " manip-il train"
         )
-    names = [key for key in (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID) if key in dataset_meta.features]
+    names = [
+        key
+        for key in (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)
+        if key in dataset_meta.features
+    ]
     columns = Dataset.open(dataset_meta.root).columns(names)
     return {key: column.reshape(len(column), -1) for key, column in columns.items()}
 
 
 def labelled(table: Table, inputs: Sequence[str]) -> tuple[Tensor, Tensor]:
-    """Return the joined columns `inputs`, (S, d), and the actions, (S, n), of the frames with a valid label."""
+    """Return the joined columns `inputs`, (S, d), and the actions, (S, n), of the frames with a
+    valid label.
+    """
     valid = torch.from_numpy(valid_frames(table))
     seen, actions = (
-        torch.cat([torch.from_numpy(table[key])[valid] for key in keys], dim=1).float() for keys in (inputs, [ACTION])
+        torch.cat([torch.from_numpy(table[key])[valid] for key in keys], dim=1).float()
+        for keys in (inputs, [ACTION])
     )
     return seen, actions
 
 
 def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:
-    """Return the indices, in the environment state, of offsets between two things; `UsageError` if there are none."""
+    """Return the indices, in the environment state, of offsets between two things.
+
+    `UsageError` if there are none.
+    """
     names = features[ENVIRONMENT_STATE]["names"] if ENVIRONMENT_STATE in features else []
     found = tuple(i for i, name in enumerate(names) if "_from_" in name)
     if not found:
-        raise UsageError(f"policy.scales needs offsets (..._from_...) among the inputs, which are {list(names)}")
+        raise UsageError(
+            f"policy.scales needs offsets (..._from_...) among the inputs, which are {list(names)}"
+        )
     return found
 
 

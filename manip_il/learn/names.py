@@ -2,7 +2,10 @@
 
 ACTION_SPACES = ("joint_target", "joint_delta", "ee_delta")
 JOINT_TARGET, JOINT_DELTA, EE_DELTA = ACTION_SPACES
-MLP, CNN = OWN_SPACE = ("mlp", "cnn")  # policies whose network converts actions itself, by default from joint_delta
+# policies whose network converts actions itself, by default from joint_delta
+MLP, CNN = OWN_SPACE = ("mlp", "cnn")
 CONVERTED = (*OWN_SPACE, "act", "diffusion", "vqbet")  # policies whose actions may be converted
-PLAIN = ("act", "cnn", "diffusion", "gaussian_actor", "mlp", "tdmpc", "vqbet")  # policies that load no models by name
-OBSERVATIONS = ("state", "images", "both")  # in addition to the joints: the true poses, pictures, or both
+# policies that load no models by name
+PLAIN = ("act", "cnn", "diffusion", "gaussian_actor", "mlp", "tdmpc", "vqbet")
+# in addition to the joints: the true poses, pictures, or both
+OBSERVATIONS = ("state", "images", "both")

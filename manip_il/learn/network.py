@@ -1,7 +1,7 @@
 """The `mlp` policy's network with the statistics of its data, in pure torch.
 
-Separate from its LeRobot interface (`manip_il.learn.mlp`), so that a worker that only acts need not spend seconds on
-importing LeRobot.
+Separate from its LeRobot interface (`manip_il.learn.mlp`), so that a worker that only acts need not
+spend seconds on importing LeRobot.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ CONSTANT_TARGET = 1e-6
 
 @dataclass
 class NetworkConfig:
-    """Sizes and kinds that a network is built from: the options of the `mlp` policy, and so of `MLPConfig`.
+    """Sizes and kinds that a network is built from: the options of the `mlp` policy, and so of
+    `MLPConfig`.
 
     Args:
         width: Units per layer.
@@ -82,7 +83,9 @@ class NetworkConfig:
             if getattr(self, name) not in known:
                 raise UnknownName(name, str(getattr(self, name)), known)
         if not all(scale > 0 for scale in self.scales):
-            raise UsageError(f"policy.scales is {list(self.scales)}; expected lengths of more than 0")
+            raise UsageError(
+                f"policy.scales is {list(self.scales)}; expected lengths of more than 0"
+            )
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> NetworkConfig:
@@ -94,10 +97,11 @@ Statistics = Mapping[str, Tensor]  # named as the buffers of `MLPNetwork`
 
 
 def fit_statistics(inputs: F32, targets: F32, loss: str) -> Statistics:
-    """Return statistics of inputs (N, d) and targets (N, n), in raw units ([rad], [m]), as float32 vectors.
+    """Return statistics of inputs (N, d) and targets (N, n), in raw units ([rad], [m]), as float32
+    vectors.
 
-    The network maps x = (input - input_mean) * input_scale to y, and target = target_mean + target_scale * y is
-    clamped to [target_low, target_high], the range of the data.
+    The network maps x = (input - input_mean) * input_scale to y, and target = target_mean +
+    target_scale * y is clamped to [target_low, target_high], the range of the data.
 
     Targets are scaled by mean and deviation, or, for `categorical`, by the middle and half-width of
     their range, which puts them in [-1, 1]. A constant target has scale 0: it equals its mean.
@@ -109,7 +113,9 @@ def fit_statistics(inputs: F32, targets: F32, loss: str) -> Statistics:
         target_mean, target_scale = _mean_and_deviation(targets)
     target_scale = np.where(target_scale < CONSTANT_TARGET, 0.0, target_scale)
     input_mean, deviation = _mean_and_deviation(inputs)
-    input_scale = np.where(deviation < CONSTANT_INPUT, 0.0, 1.0 / np.maximum(deviation, CONSTANT_INPUT))
+    input_scale = np.where(
+        deviation < CONSTANT_INPUT, 0.0, 1.0 / np.maximum(deviation, CONSTANT_INPUT)
+    )
     found = {"input_mean": input_mean, "input_scale": input_scale, "target_mean": target_mean}
     found |= {"target_scale": target_scale, "target_low": low, "target_high": high}
     return {name: torch.from_numpy(values.astype(np.float32)) for name, values in found.items()}
@@ -121,7 +127,9 @@ def _mean_and_deviation(values: F32) -> tuple[F64, F64]:
     return mean, np.sqrt(np.square(values - mean).mean(0))
 
 
-def perceptron(inputs: int, width: int, depth: int, outputs: int, activation: type[nn.Module]) -> nn.Sequential:
+def perceptron(
+    inputs: int, width: int, depth: int, outputs: int, activation: type[nn.Module]
+) -> nn.Sequential:
     """Return a network of `depth` hidden layers, (B, inputs) to (B, outputs)."""
     layers: list[nn.Module] = []
     for size in (inputs, *[width] * (depth - 1)):
@@ -130,11 +138,14 @@ def perceptron(inputs: int, width: int, depth: int, outputs: int, activation: ty
 
 
 class MLPNetwork(nn.Module):
-    """Perceptron, head and normalisation. Inputs (B, n + k) are raw; the first n are the measured joints.
+    """Perceptron, head and normalisation.
 
-    In the space `joint_delta` the targets of arm joints are relative to the measured joints, which the network adds
-    itself; the targets of grippers are absolute. In all other spaces it returns the targets, which `action_spaces`
-    converts to actions. A row's action does not depend on the other rows, bit for bit.
+    Inputs (B, n + k) are raw; the first n are the measured joints.
+
+    In the space `joint_delta` the targets of arm joints are relative to the measured joints, which
+    the network adds itself; the targets of grippers are absolute. In all other spaces it returns
+    the targets, which `action_spaces` converts to actions. A row's action does not depend on the
+    other rows, bit for bit.
     """
 
     added: Tensor  # 1 for the measured joints that are added to the targets, else 0, (n,)
@@ -157,7 +168,9 @@ class MLPNetwork(nn.Module):
         self.scaled = list(config.scaled)
         self.inputs = inputs
         inputs += len(self.scales) * len(self.scaled)
-        self.head = make_head(config.loss, n, components=config.components, bins=config.bins, sigma=config.sigma)
+        self.head = make_head(
+            config.loss, n, components=config.components, bins=config.bins, sigma=config.sigma
+        )
         activation = ACTIVATIONS[config.activation]
         self.layers = perceptron(inputs, config.width, config.depth, self.head.size, activation)
         for name, size in (("input", inputs), ("target", n)):
@@ -167,7 +180,10 @@ class MLPNetwork(nn.Module):
         self.register_buffer("target_high", torch.full((n,), torch.inf))
 
     def set_statistics(self, statistics: Statistics) -> None:
-        """Set the statistics of the data. Inputs beyond the length of `statistics` keep mean 0 and scale 1."""
+        """Set the statistics of the data.
+
+        Inputs beyond the length of `statistics` keep mean 0 and scale 1.
+        """
         for name, tensor in statistics.items():
             getattr(self, name)[: len(tensor)].copy_(tensor)
 
@@ -177,27 +193,42 @@ class MLPNetwork(nn.Module):
         self.set_statistics(fit_statistics(self.expanded(inputs).numpy(), targets, self.loss))
 
     def expanded(self, inputs: Tensor) -> Tensor:
-        """Return inputs (B, n + k) with tanh(offset / scale) appended for each scale, so that millimetres matter."""
+        """Return inputs (B, n + k) with tanh(offset / scale) appended for each scale, so that
+        millimetres matter.
+        """
         if not self.scales:
             return inputs
-        return torch.cat([inputs, *(torch.tanh(inputs[:, self.scaled] / scale) for scale in self.scales)], dim=1)
+        return torch.cat(
+            [inputs, *(torch.tanh(inputs[:, self.scaled] / scale) for scale in self.scales)], dim=1
+        )
 
     def encode(self, inputs: Tensor) -> Tensor:
         """Return the perceptron's normalised inputs for raw inputs (B, n + k)."""
-        return ((self.expanded(inputs) - self.input_mean) * self.input_scale).clamp(-self.clamp, self.clamp)
+        return ((self.expanded(inputs) - self.input_mean) * self.input_scale).clamp(
+            -self.clamp, self.clamp
+        )
 
     def encode_targets(self, targets: Tensor) -> Tensor:
-        """Return normalised targets (B, n) for raw targets (B, n), as from `relative`; 0 for a target with scale 0."""
-        inverse = torch.where(self.target_scale > 0, 1.0 / self.target_scale, torch.zeros_like(self.target_scale))
+        """Return normalised targets (B, n) for raw targets (B, n), as from `relative`.
+
+        0 for a target with scale 0.
+        """
+        inverse = torch.where(
+            self.target_scale > 0, 1.0 / self.target_scale, torch.zeros_like(self.target_scale)
+        )
         return (targets - self.target_mean) * inverse
 
     def row_losses(self, inputs: Tensor, actions: Tensor) -> Tensor:
-        """Return the loss of each row, (B,), for raw inputs (B, n + k) and absolute actions (B, n)."""
+        """Return the loss of each row, (B,), for raw inputs (B, n + k) and absolute actions (B,
+        n).
+        """
         targets = self.encode_targets(self.relative(actions, inputs))
         return self.head.nll(self.layers(self.encode(inputs)), targets)
 
     def relative(self, actions: Tensor, inputs: Tensor) -> Tensor:
-        """Return absolute actions (B, n) minus the measured joints that the network adds to its output."""
+        """Return absolute actions (B, n) minus the measured joints that the network adds to its
+        output.
+        """
         return actions - self.added * inputs[:, : self.n]
 
     @torch.no_grad()
@@ -209,16 +240,24 @@ class MLPNetwork(nn.Module):
         return torch.cat([self.actions(block) for block in padded.split(ROWS)])[:rows]
 
     def actions(self, inputs: Tensor) -> Tensor:
-        """Return actions, (B, n), for all rows at once; the last bits depend on the number of rows."""
+        """Return actions, (B, n), for all rows at once.
+
+        The last bits depend on the number of rows.
+        """
         y = self.head.action(self.layers(self.encode(inputs)))
         # The expert's targets never left this range, so the learner's must not either.
-        target = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)
+        target = torch.clamp(
+            y * self.target_scale + self.target_mean, self.target_low, self.target_high
+        )
         return target + self.added * inputs[:, : self.n]
 
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Let torch use `count` threads in a `with` block. Idle ones busy-wait: two on one core are far slower than one."""
+    """Let torch use `count` threads in a `with` block.
+
+    Idle ones busy-wait: two on one core are far slower than one.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -234,7 +273,10 @@ def require_device(device: str) -> None:
 
 
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
-    """Return weights (n, d) and statistics (n,) by name from a folder; `ManipError` if they cannot be read."""
+    """Return weights (n, d) and statistics (n,) by name from a folder.
+
+    `ManipError` if they cannot be read.
+    """
     path = Path(pretrained_model) / WEIGHTS
     with in_one_line(f"{path} cannot be read"), native_path(path, "weights") as opened:
         return {name.removeprefix("model."): tensor for name, tensor in load_file(opened).items()}
@@ -242,21 +284,28 @@ def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
-    """Copy the weights from a `pretrained_model` folder; `network` then acts like that policy, up to rounding.
+    """Copy the weights from a `pretrained_model` folder.
 
-    The input statistics stay those of the new data: the first layer compensates for the difference. (An
-    input normaliser frozen at the first round of DAgger puts later rounds' states out of scale.)
-    The range of the targets is also that of the new data; their mean and scale are copied, as they are
-    only the unit of the outputs. Raises `ManipError` for a file that cannot be read or does not fit.
+    `network` then acts like that policy, up to rounding.
+
+    The input statistics stay those of the new data: the first layer compensates for the difference.
+    (An input normaliser frozen at the first round of DAgger puts later rounds' states out of
+    scale.) The range of the targets is also that of the new data; their mean and scale are copied,
+    as they are only the unit of the outputs. Raises `ManipError` for a file that cannot be read or
+    does not fit.
     """
     of_new_data = ("input_mean", "input_scale", "target_low", "target_high")
     kept = {name: getattr(network, name).clone() for name in of_new_data}
     with in_one_line(f"the weights in {pretrained_model} do not fit the new network"):
         network.load_state_dict(read_weights(pretrained_model))
-    # x_old = (u - mean_old) scale_old and x = (u - mean) scale, so x_old = x scale_old / scale + offset
+    # x_old = (u - mean_old) scale_old and x = (u - mean) scale, so x_old = x scale_old / scale +
+    # offset
     first = network.layers[0]
     assert isinstance(first, torch.nn.Linear)
-    offset, scale = (kept["input_mean"] - network.input_mean) * network.input_scale, kept["input_scale"]
+    offset, scale = (
+        (kept["input_mean"] - network.input_mean) * network.input_scale,
+        kept["input_scale"],
+    )
     first.bias.add_(first.weight @ offset)
     first.weight.mul_(torch.where(scale > 0, network.input_scale / scale, torch.zeros_like(scale)))
     network.set_statistics(kept)

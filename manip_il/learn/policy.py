@@ -26,21 +26,30 @@ Batch = dict[str, torch.Tensor]
 
 
 class LearnedPolicy:
-    """Actions from a LeRobot checkpoint, for many episodes at once. checkpoint: its inputs, outputs and origin."""
+    """Actions from a LeRobot checkpoint, for many episodes at once. checkpoint: its inputs,
+    outputs and origin.
+    """
 
     def __init__(self, policy: EpisodePolicy | _Perceptron, checkpoint: Checkpoint):
         self.checkpoint, self._policy = checkpoint, policy
 
     @classmethod
     def load(
-        cls, checkpoint: Checkpoint | Path, device: str = "cpu", task: str = "", *, trust: bool = False
+        cls,
+        checkpoint: Checkpoint | Path,
+        device: str = "cpu",
+        task: str = "",
+        *,
+        trust: bool = False,
     ) -> LearnedPolicy:
-        """Load any LeRobot `pretrained_model` folder, only from JSON and safetensors unless `trust`.
+        """Load any LeRobot `pretrained_model` folder, only from JSON and safetensors unless
+        `trust`.
 
-        The mlp is loaded without LeRobot, whose import takes seconds; other policies by LeRobot's own factory. task:
-        instruction for a policy that reads language, if `begin` gives no other. trust: also load models and code
-        that the checkpoint names. Raises what `Checkpoint.open` raises, `ManipError` for files that do not match or,
-        without `trust`, that name models to load; `UnknownName` for an unknown type of policy.
+        The mlp is loaded without LeRobot, whose import takes seconds; other policies by LeRobot's
+        own factory. task: instruction for a policy that reads language, if `begin` gives no other.
+        trust: also load models and code that the checkpoint names. Raises what `Checkpoint.open`
+        raises, `ManipError` for files that do not match or, without `trust`, that name models to
+        load; `UnknownName` for an unknown type of policy.
         """
         require_device(device)
         opened = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint.open(checkpoint)
@@ -62,21 +71,28 @@ class LearnedPolicy:
 
     @torch.inference_mode()
     def act(
-        self, states: F32, environment_states: F32, images: Images | None = None, episodes: Sequence[int] | None = None
+        self,
+        states: F32,
+        environment_states: F32,
+        images: Images | None = None,
+        episodes: Sequence[int] | None = None,
     ) -> F64:
-        """Return absolute actions, (B, n), as in the training data: usually joint targets [rad], gripper command [m].
+        """Return absolute actions, (B, n), as in the training data: usually joint targets [rad],
+        gripper command [m].
 
-        states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a number for each row, by
-        default its index; the policy's memory of an episode and its random draws depend on that number. An episode that
-        is not in `episodes` has ended. An action is bit-identical whatever the other rows are. Raises `NotFiniteError`
-        naming the row for an action that is not finite, `MismatchError` for pictures that are missing or of another
-        size.
+        states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a
+        number for each row, by default its index; the policy's memory of an episode and its random
+        draws depend on that number. An episode that is not in `episodes` has ended. An action is
+        bit-identical whatever the other rows are. Raises `NotFiniteError` naming the row for an
+        action that is not finite, `MismatchError` for pictures that are missing or of another size.
         """
         if not len(states):
             return np.empty((0, self.checkpoint.action))
         batch = self._numbers(states, environment_states) | self._pictures(images or {})
         with threads(1):
-            actions = self._policy.select(batch, range(len(states)) if episodes is None else episodes)
+            actions = self._policy.select(
+                batch, range(len(states)) if episodes is None else episodes
+            )
         found = actions.cpu().numpy().astype(np.float64)
         if not (finite := np.isfinite(found)).all():
             row = int(np.argmin(finite.all(axis=1)))
@@ -86,7 +102,8 @@ class LearnedPolicy:
     def begin(self, instructions: Mapping[int, str]) -> None:
         """Reset the memory of episodes that begin.
 
-        instructions: episode number -> text for a policy that reads language; "" means the `task` given to `load`.
+        instructions: episode number -> text for a policy that reads language; "" means the `task`
+        given to `load`.
         """
         self._policy.begin(instructions)
 
@@ -111,21 +128,32 @@ class LearnedPolicy:
         return batch
 
 
-def actions_along(policy: LearnedPolicy, table: Mapping[str, NDArray[Any]]) -> Iterator[tuple[I64, F64]]:
-    """Yield row numbers (B,) and a policy's actions (B, n) for each time step of whole recorded episodes.
+def actions_along(
+    policy: LearnedPolicy, table: Mapping[str, NDArray[Any]]
+) -> Iterator[tuple[I64, F64]]:
+    """Yield row numbers (B,) and a policy's actions (B, n) for each time step of whole recorded
+    episodes.
 
-    table: columns `observation.state`, `observation.environment_state` and `episode_index`, one episode after another.
+    table: columns `observation.state`, `observation.environment_state` and `episode_index`, one
+    episode after another.
     """
     episodes = table[EPISODE_INDEX].reshape(-1)
     _, lengths = np.unique(episodes, return_counts=True)
     steps = np.concatenate([*map(np.arange, lengths)])
     for step in range(lengths.max()):  # in order, for policies with a memory
         rows = np.flatnonzero(steps == step)
-        yield rows, policy.act(table[STATE][rows], table[ENVIRONMENT_STATE][rows], {}, episodes[rows].tolist())
+        yield (
+            rows,
+            policy.act(
+                table[STATE][rows], table[ENVIRONMENT_STATE][rows], {}, episodes[rows].tolist()
+            ),
+        )
 
 
 class _Perceptron:
-    """The mlp: no memory, and one call for all rows, whose actions are independent of each other."""
+    """The mlp: no memory, and one call for all rows, whose actions are independent of each
+    other.
+    """
 
     def __init__(self, checkpoint: Checkpoint, device: str):
         self._device = device
@@ -135,19 +163,23 @@ class _Perceptron:
             self.module = MLPNetwork(width, checkpoint.action, NetworkConfig.of(checkpoint.config))
             self.module.load_state_dict(read_weights(checkpoint.path))
         self.module.to(device).eval()
-        space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET  # the network converts joint_delta
+        # the network converts joint_delta
+        space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET
         self._conversion = Conversion(space, checkpoint.robot)
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action per row, (B, n).
 
-        The mlp's processors are the identity (see MLPConfig), except for the conversion of an action space.
+        The mlp's processors are the identity (see MLPConfig), except for the conversion of an
+        action space.
         """
         inputs = torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)
         targets = self.module.act(inputs)
         if self._conversion.space == JOINT_TARGET:
             return targets
-        return torch.from_numpy(self._conversion.decode(targets.cpu().numpy(), batch[STATE].numpy()))
+        return torch.from_numpy(
+            self._conversion.decode(targets.cpu().numpy(), batch[STATE].numpy())
+        )
 
     def begin(self, instructions: Mapping[int, str]) -> None:
         """Do nothing: the mlp has no memory, and does not read language."""

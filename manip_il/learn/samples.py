@@ -1,7 +1,8 @@
 """The samples of a fit in memory: numbers as tables, pictures decoded once.
 
-A sample may include frames around its own, its window, which LeRobot's policies define by `*_delta_indices`. Frames
-outside the episode are replaced by the nearest one inside, and `<column>_is_pad` marks them.
+A sample may include frames around its own, its window, which LeRobot's policies define by
+`*_delta_indices`. Frames outside the episode are replaced by the nearest one inside, and
+`<column>_is_pad` marks them.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,9 +34,11 @@ _MAX_HELD_OUT = 1_024  # number of validation samples
 
 @dataclass(frozen=True)
 class Windows:
-    """The frames that each sample consists of. episodes: the episode of every frame, (N,), ascending.
+    """The frames that each sample consists of. episodes: the episode of every frame, (N,),
+    ascending.
 
-    deltas: column -> offsets from the sample's own frame, (K,); other columns have only the sample's own frame.
+    deltas: column -> offsets from the sample's own frame, (K,); other columns have only the
+    sample's own frame.
     """
 
     episodes: I64
@@ -51,7 +54,8 @@ class Windows:
         return np.searchsorted(self.episodes, self.episodes, side="right") - 1
 
     def rows(self, samples: I64, key: str) -> tuple[I64, Batch]:
-        """Return the row numbers of a column's windows, (B, K), and `<column>_is_pad` -> its padding mask, (B, K).
+        """Return the row numbers of a column's windows, (B, K), and `<column>_is_pad` -> its
+        padding mask, (B, K).
 
         For a column without a window, return `samples` themselves, (B,), and no mask.
         """
@@ -64,32 +68,39 @@ class Windows:
     def usable(self, valid: NDArray[np.bool_], drop_last: int = 0) -> I64:
         """Return the samples to train on, (S,): those with valid labels in the whole window.
 
-        valid: whether each frame's label is valid, (N,). drop_last: number of unused frames at the end of each
-        episode, LeRobot's `drop_n_last_frames`. Raises `ManipError` if nothing is left.
+        valid: whether each frame's label is valid, (N,). drop_last: number of unused frames at the
+        end of each episode, LeRobot's `drop_n_last_frames`. Raises `ManipError` if nothing is left.
         """
         samples = np.flatnonzero(np.arange(len(valid)) + drop_last <= self._last)
         sound = valid[self.rows(samples, ACTION)[0]]
         samples = samples[sound if sound.ndim == 1 else sound.all(axis=1)]
         if len(samples) == 0:
             raise ManipError(
-                f"none of {len(valid)} frames has valid labels in its whole window, so there is nothing to learn from"
+                f"none of {len(valid)} frames has valid labels in its whole window, so there is"
+                " nothing to learn from"
             )
         return samples
 
 
 def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) -> Windows:
-    """Return the windows of a policy's training samples; episodes: the episode of every frame, (N,)."""
+    """Return the windows of a policy's training samples.
+
+    episodes: the episode of every frame, (N,).
+    """
     actions, observations = policy.action_delta_indices, policy.observation_delta_indices
     wanted = {key: actions if key == ACTION else observations for key in columns}
-    return Windows(episodes, {key: np.asarray(one, np.int64) for key, one in wanted.items() if one is not None})
+    return Windows(
+        episodes, {key: np.asarray(one, np.int64) for key, one in wanted.items() if one is not None}
+    )
 
 
 @dataclass(frozen=True)
 class Samples:
     """Samples in memory; a batch is one gather per column.
 
-    columns: numeric columns, (N, d) or (N,), by LeRobot's names. pictures: camera column -> uint8 (N, 3, H, W). tasks:
-    text of every `task_index`, (M,). train, held_out: rows of the samples to train on and to validate with, (S,) each.
+    columns: numeric columns, (N, d) or (N,), by LeRobot's names. pictures: camera column -> uint8
+    (N, 3, H, W). tasks: text of every `task_index`, (M,). train, held_out: rows of the samples to
+    train on and to validate with, (S,) each.
     """
 
     windows: Windows
@@ -105,7 +116,9 @@ class Samples:
         for key in (*self.columns, *self.pictures):
             rows, padded = self.windows.rows(samples, key)
             pictured = key in self.pictures
-            batch[key] = torch.from_numpy(self.pictures[key][rows]) if pictured else self.columns[key][rows]
+            batch[key] = (
+                torch.from_numpy(self.pictures[key][rows]) if pictured else self.columns[key][rows]
+            )
             batch |= padded
         batch[TASK] = self.tasks[batch[TASK_INDEX].numpy()].tolist()
         return batch
@@ -124,10 +137,12 @@ def load_data(
 
     Args:
         policy: The policy's options, with features.
-        meta: The datasets. Its `table` becomes the numeric columns, and its statistics those of the encoded actions.
+        meta: The datasets. Its `table` becomes the numeric columns, and its statistics those of the
+            encoded actions.
         eval_split: Share of the episodes that are held out.
         seed: Decides which episodes are held out.
-        encode: Maps actions (N, n) and states (N, n) to targets; None if the targets are the datasets' actions.
+        encode: Maps actions (N, n) and states (N, n) to targets; None if the targets are the
+            datasets' actions.
         on_frames: Called with the number of newly decoded frames.
 
     Raises:
@@ -144,7 +159,8 @@ def load_data(
     table[LABEL_VALID] = np.concatenate([_label_valid(dataset) for dataset in meta.datasets])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     for key in numbers:
-        table[key] = table[key].reshape(len(table[key]), -1)  # a column with one number per frame becomes a vector, too
+        # a column with one number per frame becomes a vector, too
+        table[key] = table[key].reshape(len(table[key]), -1)
         require_finite(f"column {key}", table[key])
     if encode is not None:
         table[ACTION] = encode(table[ACTION].astype(np.float32), table[STATE])
@@ -159,7 +175,10 @@ def load_data(
     return Samples(
         windows,
         {key: torch.from_numpy(table[key]) for key in (*numbers, *_ALWAYS)},
-        {key: decode([dataset.camera(key) for dataset in meta.datasets], on_frames) for key in cameras},
+        {
+            key: decode([dataset.camera(key) for dataset in meta.datasets], on_frames)
+            for key in cameras
+        },
         np.array(meta.tasks, object),
         usable[train],
         usable[held_out],
@@ -174,16 +193,22 @@ def _label_valid(dataset: Dataset) -> NDArray[Any]:
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:
-    """Return whether each frame counts in the loss, (N,), by its `label_valid`; all count without such a column."""
+    """Return whether each frame counts in the loss, (N,), by its `label_valid`.
+
+    All count without such a column.
+    """
     if LABEL_VALID not in table:
         return np.ones(len(table[ACTION]), dtype=bool)
     return np.asarray(table[LABEL_VALID]).reshape(-1) != 0
 
 
 def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I64]:
-    """Return the rows to train on and to hold out; whole episodes are held out, about `fraction` of them.
+    """Return the rows to train on and to hold out.
 
-    episodes: the episode of every row, (N,). Nothing is held out if `fraction` rounds to none or all of the episodes.
+    Whole episodes are held out, about `fraction` of them.
+
+    episodes: the episode of every row, (N,). Nothing is held out if `fraction` rounds to none or
+    all of the episodes.
     """
     names = np.unique(episodes)
     count = round(fraction * len(names))
@@ -195,13 +220,16 @@ def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I6
 
 
 def rabc_weights(path: Path, episodes: I64, ahead: int) -> F64:
-    """Return the weight of every frame, (N,), at most 1, from a file with the progress of every frame.
+    """Return the weight of every frame, (N,), at most 1, from a file with the progress of every
+    frame.
 
-    The weights are those of LeRobot's RA-BC (Chen et al. 2025, arXiv:2509.25358, equations 8 and 9). LeRobot
-    multiplies losses by them; here samples are drawn in proportion to them, which gives the same mean gradient.
+    The weights are those of LeRobot's RA-BC (Chen et al. 2025, arXiv:2509.25358, equations 8 and
+    9). LeRobot multiplies losses by them; here samples are drawn in proportion to them, which gives
+    the same mean gradient.
 
-    episodes: the dataset's `episode_index`, (N,). ahead: number of frames over which the gain in progress is measured.
-    Raises `ManipError` if the file cannot be read or every frame weighs 0, `MismatchError` for another dataset's file.
+    episodes: the dataset's `episode_index`, (N,). ahead: number of frames over which the gain in
+    progress is measured. Raises `ManipError` if the file cannot be read or every frame weighs 0,
+    `MismatchError` for another dataset's file.
     """
     from lerobot.rewards.sarm.rabc import RABCWeights  # its import takes seconds
 
@@ -209,10 +237,13 @@ def rabc_weights(path: Path, episodes: I64, ahead: int) -> F64:
         found = RABCWeights(path, chunk_size=ahead, device=torch.device("cpu"))
     if found.episode_lookup != dict(enumerate(episodes.tolist())):
         frames = f"{len(found.episode_lookup)} frames"
-        raise MismatchError("division into episodes", str(path), frames, "the dataset", f"{len(episodes)} frames")
+        raise MismatchError(
+            "division into episodes", str(path), frames, "the dataset", f"{len(episodes)} frames"
+        )
     weights, _ = found.compute_batch_weights({"index": np.arange(len(episodes))})
     if not weights.any():
         raise ManipError(
-            f"all {len(weights)} frames weigh 0, as progress falls after each; there is nothing to learn from"
+            f"all {len(weights)} frames weigh 0, as progress falls after each; there is nothing to"
+            " learn from"
         )
     return (weights / weights.max()).double().numpy()

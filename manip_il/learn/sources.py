@@ -1,7 +1,7 @@
 """Training on several datasets as one: what must agree between them, and how often each is sampled.
 
-Normalisation statistics cover the frames of all datasets, each counted once, whatever the weights. The weights can thus
-change without changing the units in which a policy observes and acts.
+Normalisation statistics cover the frames of all datasets, each counted once, whatever the weights.
+The weights can thus change without changing the units in which a policy observes and acts.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,8 @@ from manip_il.worlds.contract import EnvironmentSpec
 def row_weights(datasets: Sequence[Dataset], shares: Sequence[float], rows: I64) -> F64:
     """Return the relative sampling weight of each training row, (S,).
 
-    shares: relative shares of the samples drawn from each dataset. rows: frame numbers in the concatenated datasets.
+    shares: relative shares of the samples drawn from each dataset. rows: frame numbers in the
+    concatenated datasets.
     """
     which = np.searchsorted(np.cumsum([*map(len, datasets)]), rows, side="right")
     return np.asarray(shares)[which] / np.bincount(which)[which]
@@ -34,8 +35,8 @@ def check_same_sources(
 ) -> None:
     """Raise `MismatchError` naming both sides unless datasets can be used as one.
 
-    pictures: whether the policy takes them, so that cameras and sizes must agree, too. language: whether the policy
-    reads an instruction; if not, the task must be the same.
+    pictures: whether the policy takes them, so that cameras and sizes must agree, too. language:
+    whether the policy reads an instruction; if not, the task must be the same.
     """
     what = (*(("cameras", "image_size") if pictures else ()), *(() if language else ("task",)))
     for root, spec in zip(roots[1:], specs[1:], strict=True):
@@ -49,8 +50,8 @@ def check_same_sources(
 def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
     """Return the columns of a dataset that a policy observes, by LeRobot's names.
 
-    Without `observation.environment_state` the joints are enough for an mlp, and where there are no pictures either.
-    Raises `ManipError`, with a remedy, for a column that the dataset lacks.
+    Without `observation.environment_state` the joints are enough for an mlp, and where there are no
+    pictures either. Raises `ManipError`, with a remedy, for a column that the dataset lacks.
     """
     pictured = [key for key, feature in info.features.items() if feature.is_rgb]
     cameras = pictured if config.takes_images else []
@@ -61,21 +62,32 @@ def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
         lacking.append("pictures")
     if lacking:
         raise ManipError(
-            f"{root}: the dataset has no {' and no '.join(lacking)}, which --observation={config.observes} needs; "
-            f"choose another --observation or --policy.type, or record with manip-il record"
-            f"{' --cameras=front,side' if config.takes_images else ''}"
+            f"{root}: the dataset has no {' and no '.join(lacking)}, which"
+            f" --observation={config.observes} needs; choose another --observation or"
+            " --policy.type, or record with manip-il"
+            f" record{' --cameras=front,side' if config.takes_images else ''}"
         )
     return [*numbers, *cameras]
 
 
-def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the lighting of a dataset's pictures, as arguments of `sim.look.Look`; {} is the default.
+def recorded_look(
+    provenance: Mapping[str, Any], fingerprint: Mapping[str, Any]
+) -> dict[str, Any] | None:
+    """Return the lighting of a dataset's pictures, as arguments of `sim.look.Look`.
 
-    None if unknown: for another program's dataset, one without pictures, or one merged from different ones.
+    {} is the default.
+
+    None if unknown: for another program's dataset, one without pictures, or one merged from
+    different ones.
     """
     if "cameras_sha256" not in fingerprint:
         return None
-    merged = [] if "rendered" in provenance else [one["provenance"] for one in provenance.get("merged", [])]
+    merged = (
+        []
+        if "rendered" in provenance
+        else [one["provenance"] for one in provenance.get("merged", [])]
+    )
     drawn = [one.get("rendered") or one.get("redrawn") or {} for one in merged or [provenance]]
-    looks = [dict((one.get("cameras") or {}).get("look", {})) for one in drawn]  # `record` uses the default lighting
+    # `record` uses the default lighting
+    looks = [dict((one.get("cameras") or {}).get("look", {})) for one in drawn]
     return looks[0] if all(look == looks[0] for look in looks) else None

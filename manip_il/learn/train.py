@@ -1,6 +1,8 @@
-"""Behaviour cloning of any policy, LeRobot's or ours, with its optimiser, schedule, processors and checkpoints.
+"""Behaviour cloning of any policy, LeRobot's or ours, with its optimiser, schedule, processors and
+checkpoints.
 
-The data are in memory, so that a batch is one gather per column; a batch depends only on seed and step.
+The data are in memory, so that a batch is one gather per column; a batch depends only on seed and
+step.
 
 Train a policy on datasets: behaviour cloning.
 """
@@ -56,12 +58,14 @@ from manip_il.option import make_options
 from manip_il.progress import Progress
 from manip_il.seeding import stream_base
 
-_METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")  # metrics that LeRobot's `update_policy` sets
+# metrics that LeRobot's `update_policy` sets
+_METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
 
 
 class Trainer:
-    """One run of behaviour cloning on labelled datasets: its data, its networks, and the steps that fit them.
+    """One run of behaviour cloning on labelled datasets: its data, its networks, and the steps that
+    fit them.
 
     On one CPU the same data, config and threads give the same bits, resumed or not. If started by
     `accelerate launch` or `torchrun`, every process takes `batch_size` samples per step.
@@ -98,8 +102,13 @@ class Trainer:
         self.config = config
         self.output_dir = output_dir
         self.datasets = datasets
-        roots, specs = [dataset.root for dataset in datasets], [dataset.spec for dataset in datasets]
-        check_same_sources(roots, specs, pictures=config.takes_images, language=config.kind not in PLAIN)
+        roots, specs = (
+            [dataset.root for dataset in datasets],
+            [dataset.spec for dataset in datasets],
+        )
+        check_same_sources(
+            roots, specs, pictures=config.takes_images, language=config.kind not in PLAIN
+        )
         spec = specs[0]
         self.pipeline: Any  # LeRobot's options
         self.pipeline, space = lerobot_options(config, spec.action_meaning)
@@ -128,7 +137,9 @@ class Trainer:
             policy.action_space = self.conversion.space
             policy.grippers = self.conversion.grippers
         set_features(policy, self.meta.features, columns, config.observes)
-        self.pipeline.dataset = DatasetConfig(self.meta.repo_id, root=str(_portable(self.datasets[-1].root)))
+        self.pipeline.dataset = DatasetConfig(
+            self.meta.repo_id, root=str(_portable(self.datasets[-1].root))
+        )
         return load_data(
             policy,
             self.meta,
@@ -152,7 +163,10 @@ class Trainer:
         return Origin.of(
             first.spec,
             first.fingerprint,
-            {"eval_split": self.config.eval_split, "augment": asdict(self._augment) if self._augment else None},
+            {
+                "eval_split": self.config.eval_split,
+                "augment": asdict(self._augment) if self._augment else None,
+            },
             self.config.observes,
             recorded_look(first.provenance, first.fingerprint),
             datasets=[
@@ -163,7 +177,9 @@ class Trainer:
         )
 
     def build_networks(self, resumed: Checkpoint | None) -> None:
-        """Build policy, processors, optimiser and schedule, or load them from the checkpoint to resume."""
+        """Build policy, processors, optimiser and schedule, or load them from the checkpoint to
+        resume.
+        """
         set_seed(self.config.seed % 2**32)  # NumPy takes no larger seeds
         config = self.pipeline.policy
         policy = build_policy(config, self.meta, resumed)
@@ -174,22 +190,32 @@ class Trainer:
             last = resumed.path.parent
             with in_one_line(f"{last} cannot be resumed; start again with --overwrite=true"):
                 learns = self.encoder is not None
-                processors = load_processors(resumed, config, trust=self.config.trust, learns=learns)
+                processors = load_processors(
+                    resumed, config, trust=self.config.trust, learns=learns
+                )
                 self.step, optimizer, scheduler = load_training_state(last, optimizer, scheduler)
         self.preprocessor, self.postprocessor = processors
-        self.policy, self.optimizer, self.scheduler = self.accelerator.prepare(policy, optimizer, scheduler)
-        self.unwrapped = self.accelerator.unwrap_model(self.policy)  # without the wrapper of distributed training
+        self.policy, self.optimizer, self.scheduler = self.accelerator.prepare(
+            policy, optimizer, scheduler
+        )
+        # without the wrapper of distributed training
+        self.unwrapped = self.accelerator.unwrap_model(self.policy)
 
     def fit(self, on_step: Callable[[dict[str, Any]], None] | None = None) -> Path:
-        """Take the remaining steps, with metrics and checkpoints; return the last checkpoint's `pretrained_model`.
+        """Take the remaining steps, with metrics and checkpoints.
 
-        on_step: called after every step, with the metrics if there are any, else with {}; an exception from it ends
-        the fit (after `KeyboardInterrupt` a checkpoint is saved). Raises `NotFiniteError` if the loss is not finite.
+        Return the last checkpoint's `pretrained_model`.
+
+        on_step: called after every step, with the metrics if there are any, else with {}; an
+        exception from it ends the fit (after `KeyboardInterrupt` a checkpoint is saved). Raises
+        `NotFiniteError` if the loss is not finite.
         """
         self.pipeline.output_dir = self.output_dir
         metrics = contextlib.nullcontext(list[Writer]())
         if self.accelerator.is_main_process:
-            metrics = metric_writers(self.output_dir, self.step, self.config.tensorboard, self.pipeline)
+            metrics = metric_writers(
+                self.output_dir, self.step, self.config.tensorboard, self.pipeline
+            )
         with threads(self.config.threads), metrics as writers:
             for record in self.run():
                 for write in writers if record else []:
@@ -208,7 +234,10 @@ class Trainer:
         return self.output_dir / "checkpoints" / "last" / PRETRAINED_MODEL
 
     def run(self) -> Iterator[dict[str, Any]]:
-        """Take the remaining steps; yield metrics after every `log_freq`-th and the last step, {} after the others."""
+        """Take the remaining steps.
+
+        Yield metrics after every `log_freq`-th and the last step, {} after the others.
+        """
         metrics = MetricsTracker(1, 1, 1, {name: AverageMeter(name) for name in _METRICS})
         since, started = self.step, time.perf_counter()
         while self.step < self.pipeline.steps:
@@ -225,7 +254,10 @@ class Trainer:
             since, started = self.step, time.perf_counter()
 
     def take_step(self, metrics: MetricsTracker) -> None:
-        """Take one gradient step, which `metrics` counts. Raises `NotFiniteError` if the loss is not finite."""
+        """Take one gradient step, which `metrics` counts.
+
+        Raises `NotFiniteError` if the loss is not finite.
+        """
         update_policy(
             metrics,
             self.policy,
@@ -237,7 +269,9 @@ class Trainer:
         )
         loss, lr = metrics.metrics["loss"].val, metrics.metrics["lr"].val
         if not math.isfinite(loss):
-            raise NotFiniteError(f"the loss is {loss} at step {self.step}; lower the learning rate ({lr:g})")
+            raise NotFiniteError(
+                f"the loss is {loss} at step {self.step}; lower the learning rate ({lr:g})"
+            )
         self.step += 1
 
     def batch(self, step: int) -> Batch:
@@ -247,7 +281,8 @@ class Trainer:
         return self.data.batch(self.data.train[rows])
 
     def validate(self) -> dict[str, float]:
-        """Return the mean loss on samples of held-out episodes, without changing the random state of training.
+        """Return the mean loss on samples of held-out episodes, without changing the random state
+        of training.
 
         Also returns the other numbers that the policy outputs, such as the parts of its loss.
         """
@@ -256,7 +291,8 @@ class Trainer:
         policy.eval()
         sums = defaultdict[str, float](float)
         with torch.no_grad(), torch.random.fork_rng(), self.accelerator.autocast():
-            torch.manual_seed(self.config.seed)  # policies that sample (diffusion) draw the same every time
+            # policies that sample (diffusion) draw the same every time
+            torch.manual_seed(self.config.seed)
             for start in range(0, len(held_out), size):
                 rows: I64 = held_out[start : start + size]
                 batch = pictures_to_float(self.data.batch(rows), self.data.pictures)
@@ -271,16 +307,27 @@ class Trainer:
         if self.accelerator.is_main_process:
             pipeline = copy.copy(self.pipeline)
             pipeline.output_dir = _portable(self.output_dir)
-            with new_checkpoint(get_step_checkpoint_dir(self.output_dir, pipeline.steps, self.step)) as new:
-                state, processors = (self.optimizer, self.scheduler), (self.preprocessor, self.postprocessor)
+            with new_checkpoint(
+                get_step_checkpoint_dir(self.output_dir, pipeline.steps, self.step)
+            ) as new:
+                state, processors = (
+                    (self.optimizer, self.scheduler),
+                    (self.preprocessor, self.postprocessor),
+                )
                 save_checkpoint(new, self.step, pipeline, self.unwrapped, *state, *processors)
-                write_own_files(new, self.origin, read_step(new) | {"batch_size": pipeline.batch_size})
+                write_own_files(
+                    new, self.origin, read_step(new) | {"batch_size": pipeline.batch_size}
+                )
         self.accelerator.wait_for_everyone()
 
     def _augmented(self, batch: Batch) -> Batch:
-        """Move pictures to the device, shifted and recoloured by draws that depend only on seed, step and process."""
+        """Move pictures to the device, shifted and recoloured by draws that depend only on seed,
+        step and process.
+        """
         cameras, augment = self.data.pictures, self._augment
-        batch = batch | {key: batch[key].to(self.accelerator.device, non_blocking=True) for key in cameras}
+        batch = batch | {
+            key: batch[key].to(self.accelerator.device, non_blocking=True) for key in cameras
+        }
         if augment is None:
             return pictures_to_float(batch, cameras)
         generator = generator_of(self.config.seed, self.step, self.accelerator.process_index)
@@ -288,28 +335,40 @@ class Trainer:
 
 
 def _portable(path: Path) -> Path:
-    """Return a path without machine-specific parts: relative to the current folder, or else only the folder's name."""
+    """Return a path without machine-specific parts: relative to the current folder, or else only
+    the folder's name.
+    """
     if not path.is_absolute():
         return path
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else Path(path.name)
 
 
 def _accelerator(policy: PreTrainedConfig) -> Accelerator:
-    """Return an accelerator as in lerobot-train. The policy's `dtype`, if any, or else `use_amp` sets the precision."""
+    """Return an accelerator as in lerobot-train.
+
+    The policy's `dtype`, if any, or else `use_amp` sets the precision.
+    """
     precision = _HALF_PRECISION.get(getattr(policy, "dtype", None) or "", "no")
     if not hasattr(policy, "dtype") and policy.use_amp:
         precision = "fp16"
         if policy.device == "cpu":
-            has_bfloat16 = torch.ops.mkldnn._is_mkldnn_bf16_supported()  # pyright: ignore[reportPrivateUsage]
-            precision = "bf16" if has_bfloat16 else "no"
-    if not torch.distributed.is_initialized():  # accelerate keeps the precision of the first fit in a process
-        AcceleratorState._reset_state(reset_partial_state=True)  # pyright: ignore[reportPrivateUsage]
-    ours = policy.type in OWN_SPACE  # every process has equal buffers, except for the cnn's mean error
+            mkldnn: Any = torch.ops.mkldnn
+            precision = "bf16" if mkldnn._is_mkldnn_bf16_supported() else "no"
+    # accelerate keeps the precision of the first fit in a process
+    if not torch.distributed.is_initialized():
+        state: Any = AcceleratorState
+        state._reset_state(reset_partial_state=True)
+    # every process has equal buffers, except for the cnn's mean error
+    ours = policy.type in OWN_SPACE
     return Accelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,
         cpu=policy.device == "cpu",
-        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=not ours, broadcast_buffers=not ours)],
+        kwargs_handlers=[
+            DistributedDataParallelKwargs(
+                find_unused_parameters=not ours, broadcast_buffers=not ours
+            )
+        ],
     )
 
 
@@ -350,7 +409,9 @@ def train(
     given = (datasets,) if isinstance(datasets, Data) else datasets
     folder = Path(output_dir).expanduser()
     require_ours(folder, output_of("Train"))
-    opened = [one if isinstance(one, Dataset) else Dataset.open(Path(one).expanduser()) for one in given]
+    opened = [
+        one if isinstance(one, Dataset) else Dataset.open(Path(one).expanduser()) for one in given
+    ]
     options["policy"] = with_folder(options.get("policy", {}))
     config = make_options(FitConfig, seed=stream_base("training", seed), **options)
     drawn = None if weights is None else _frame_weights(weights, opened, config)
@@ -366,7 +427,9 @@ def train(
         on_start=progress.started,
         on_frames=progress.step,
     )
-    progress.start(f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps)
+    progress.start(
+        f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps
+    )
     return Checkpoint.open(trainer.fit(progress.log))
 
 

@@ -1,14 +1,17 @@
-"""A run's metrics, and its checkpoints in LeRobot's layout: how they are written, atomically, and resumed from.
+"""A run's metrics, and its checkpoints in LeRobot's layout: how they are written, atomically, and
+resumed from.
 
     OUTPUT/metrics.jsonl, OUTPUT/tensorboard
-    OUTPUT/checkpoints/004000/pretrained_model/   config.json model.safetensors policy_*processor*.json|safetensors
-                                                  train_config.json manip_il.json
-                             /training_state/     optimizer_*.safetensors|json scheduler_state.json
-                                                  rng_state.safetensors training_step.json
+    OUTPUT/checkpoints/004000/pretrained_model/   config.json manip_il.json model.safetensors
+                                                  policy_*processor*.json|safetensors
+                                                  train_config.json
+                             /training_state/     optimizer_*.safetensors|json rng_state.safetensors
+                                                  scheduler_state.json training_step.json
     OUTPUT/checkpoints/last -> 004000
 
-A checkpoint is written under a temporary name and `last` is switched over by one rename, so that a killed run keeps the
-previous one. `lerobot-train --config_path=.../pretrained_model/train_config.json --resume=true` can also resume a run.
+A checkpoint is written under a temporary name and `last` is switched over by one rename, so that a
+killed run keeps the previous one. `lerobot-train
+--config_path=.../pretrained_model/train_config.json --resume=true` can also resume a run.
 """
 
 from __future__ import annotations
@@ -50,19 +53,26 @@ def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
 
 
 def read_step(checkpoint: Path) -> dict[str, Any]:
-    """Return what `training_step.json` in a checkpoint folder holds. Raises `ManipError` if it cannot be read."""
+    """Return what `training_step.json` in a checkpoint folder holds.
+
+    Raises `ManipError` if it cannot be read.
+    """
     return checks.read_json(checkpoint / TRAINING_STATE / STEP_FILE, "the step of a run")
 
 
 @contextmanager
 def new_checkpoint(final: Path) -> Generator[Path]:
-    """Yield an empty folder to write a checkpoint into; on exit it is renamed to `final` and becomes `last`.
+    """Yield an empty folder to write a checkpoint into.
+
+    On exit it is renamed to `final` and becomes `last`.
 
     It is removed after an exception. Raises `ManipError` if the disk is full or read-only.
     """
-    with new_folder(final, replaces=CHECKPOINT) as new:  # replaces the folder of a run killed before it switched `last`
+    # replaces the folder of a run killed before it switched `last`
+    with new_folder(final, replaces=CHECKPOINT) as new:
         yield new
-        for path in new.rglob("*.safetensors"):  # without this, other users, such as a container's, could not read them
+        # without this, other users, such as a container's, could not read them
+        for path in new.rglob("*.safetensors"):
             path.chmod(new.stat().st_mode & 0o666)
     link = final.parent / ".last.tmp"
     link.unlink(missing_ok=True)
@@ -71,7 +81,9 @@ def new_checkpoint(final: Path) -> Generator[Path]:
 
 
 def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -> None:
-    """Write our own files of a checkpoint: the origin, and `step`, the content of `training_step.json`."""
+    """Write our own files of a checkpoint: the origin, and `step`, the content of
+    `training_step.json`.
+    """
     for path, values in (
         (f"{PRETRAINED_MODEL}/{META_FILE}", origin.to_json()),
         (f"{TRAINING_STATE}/{STEP_FILE}", step),
@@ -80,8 +92,11 @@ def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -
 
 
 @contextmanager
-def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPipelineConfig) -> Iterator[list[Writer]]:
-    """Yield functions to call with each record, which write it to the metrics file and other requested outputs.
+def metric_writers(
+    output_dir: Path, step: int, curves: bool, pipeline: TrainPipelineConfig
+) -> Iterator[list[Writer]]:
+    """Yield functions to call with each record, which write it to the metrics file and other
+    requested outputs.
 
     Args:
         output_dir: The folder of the run.
@@ -96,17 +111,24 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
         writers = [json_lines(output_dir / METRICS_FILE, step)]
         try:
             if curves:
-                writers.append(stack.enter_context(_tensorboard(output_dir / TENSORBOARD_FOLDER, step)))
+                writers.append(
+                    stack.enter_context(_tensorboard(output_dir / TENSORBOARD_FOLDER, step))
+                )
             if pipeline.wandb.enable:
                 pipeline.resume = step > 0
                 writers.append(_weights_and_biases(pipeline))
         except ImportError as error:
-            raise UsageError(f"a requested output of metrics needs {error.name}: pip install {error.name}") from error
+            raise UsageError(
+                f"a requested output of metrics needs {error.name}: pip install {error.name}"
+            ) from error
         yield writers
 
 
 def json_lines(path: Path, step: int) -> Writer:
-    """Drop the lines after `step`; return a function that appends a line, with null for non-finite numbers."""
+    """Drop the lines after `step`.
+
+    Return a function that appends a line, with null for non-finite numbers.
+    """
     kept = [record for record in read_lines(path) if record["step"] <= step] if step > 0 else []
     write_file(path, "".join(f"{json.dumps(record)}\n" for record in kept).encode())
     return functools.partial(append_line, path)

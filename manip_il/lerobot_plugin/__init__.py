@@ -1,7 +1,8 @@
-"""Our robots and policies in LeRobot's own commands: `--env.discover_packages_path=manip_il.lerobot_plugin`.
+"""Our robots and policies in LeRobot's own commands:
+`--env.discover_packages_path=manip_il.lerobot_plugin`.
 
-Importing it registers the environment type `manip_il` and the policies, as LeRobot requires of plugins. It must be a
-package, because LeRobot's parser fails on a module without `__path__`.
+Importing it registers the environment type `manip_il` and the policies, as LeRobot requires of
+plugins. It must be a package, because LeRobot's parser fails on a module without `__path__`.
 """
 
 from manip_il.learn.action_steps import JointTargetsStep, MeasuredJointsStep

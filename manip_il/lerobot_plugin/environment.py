@@ -36,15 +36,18 @@ _RENAMED = {"agent_pos": STATE, "environment_state": ENVIRONMENT_STATE}
 class ManipILEnv(EnvConfig):
     """One robot at one task, for lerobot-eval and lerobot-train.
 
-    task: a name in gymnasium (`PandaPickPlace-v0`, `PickPlace-v0`), or the path of a file with a task of your own.
-    robot: for tasks of any robot (`PickPlace-v0`, a file), a name or YAML file; by default panda. A file is opened only
-    if it is named on the command line or, in Python, by a `Path`; not if a file of options names it.
-    observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras:
-    comma-separated names. observation_height, observation_width: size of their pictures [pixels]. fps, episode_length,
-    tolerance, success_steps, object: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`.
-    render_mode: with `none` lerobot-eval's films are black, which needs no OpenGL and hardly any time.
+    task: a name in gymnasium (`PandaPickPlace-v0`, `PickPlace-v0`), or the path of a file with a
+    task of your own. robot: for tasks of any robot (`PickPlace-v0`, a file), a name or YAML file;
+    by default panda. A file is opened only if it is named on the command line or, in Python, by a
+    `Path`; not if a file of options names it. observation: `state` (joints and
+    `environment_state`), `images` (joints and cameras) or `both`. cameras: comma-separated names.
+    observation_height, observation_width: size of their pictures [pixels]. fps, episode_length,
+    tolerance, success_steps, object: `control_hz`, `horizon`, ... of
+    `manip_il.sim.config.EnvConfig`. render_mode: with `none` lerobot-eval's films are black, which
+    needs no OpenGL and hardly any time.
 
-    Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number out of range.
+    Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number
+    out of range.
     """
 
     task: str | None = "PandaPickPlace-v0"
@@ -83,13 +86,21 @@ class ManipILEnv(EnvConfig):
     @override
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of `gymnasium.make` besides the id."""
-        return {"config": self._simulation(), "film": self.render_mode != "none", "cameras": self._cameras()}
+        return {
+            "config": self._simulation(),
+            "film": self.render_mode != "none",
+            "cameras": self._cameras(),
+        }
 
     @override
-    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """Return the environments in LeRobot's form, in processes forked from a server that has done the slow imports.
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, VectorEnv]]:
+        """Return the environments in LeRobot's form, in processes forked from a server that has
+        done the slow imports.
 
-        Python 3.12 should preload the running command by itself, but its fork server loses the path of that command.
+        Python 3.12 should preload the running command by itself, but its fork server loses the path
+        of that command.
         """
         commands = [name for name in _COMMANDS if name in sys.modules]
         multiprocessing.get_context("forkserver").set_forkserver_preload([*commands, __name__])
@@ -103,7 +114,8 @@ class ManipILEnv(EnvConfig):
         robot, task = TASKS.get(base) or (robot, ANY_ROBOTS.get(base, base))
         if self.robot and self.robot != robot:
             raise UsageError(
-                f"--env.robot is {self.robot!r}, but --env.task={name} is for {robot}; leave one of them out"
+                f"--env.robot is {self.robot!r}, but --env.task={name} is for {robot}; leave one of"
+                " them out"
             )
         task = type(name)(task + colon + argument)
         limits = self.tolerance, self.success_steps, self.episode_length
@@ -116,7 +128,9 @@ class ManipILEnv(EnvConfig):
         return CameraConfig(names, self.observation_height, self.observation_width)
 
     def _features(self) -> dict[str, PolicyFeature]:
-        """Return the features by observation name, but cameras by column, as LeRobot's recorder requires."""
+        """Return the features by observation name, but cameras by column, as LeRobot's recorder
+        requires.
+        """
         cameras = self._cameras()
         spec = env_spec(self._simulation(), cameras)
         joints = (len(spec.joint_names),)
@@ -132,15 +146,23 @@ class ManipILEnv(EnvConfig):
 
 
 def _given(text: NameOrPath) -> NameOrPath:
-    """Return `typed(text)` if the command line has it: LeRobot also reads options from files in checkpoints."""
+    """Return `typed(text)` if the command line has it: LeRobot also reads options from files in
+    checkpoints.
+    """
     return typed(text) if any(f"={word}".endswith(f"={text}") for word in sys.argv) else text
 
 
 class FilmedEnv(ManipEnv):
-    """`ManipEnv` for lerobot-eval, which always films: if `film` is false, its pictures are small and black."""
+    """`ManipEnv` for lerobot-eval, which always films: if `film` is false, its pictures are
+    small and black.
+    """
 
-    def __init__(self, config: SimConfig, *, film: bool, cameras: CameraConfig | None, **gymnasiums: Any):
-        super().__init__(*parts_of(config), config, cameras=cameras, render_mode="rgb_array", **gymnasiums)
+    def __init__(
+        self, config: SimConfig, *, film: bool, cameras: CameraConfig | None, **gymnasiums: Any
+    ):
+        super().__init__(
+            *parts_of(config), config, cameras=cameras, render_mode="rgb_array", **gymnasiums
+        )
         self._film = film
 
     @override

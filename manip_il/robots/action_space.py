@@ -12,32 +12,43 @@ from manip_il.mdp import F64
 
 @dataclass(frozen=True, eq=False)
 class ServoUnits:
-    """Conversion of joints [rad] and a gripper opening [m] to servo units (degrees; gripper 0 to 100) and back.
+    """Conversion of joints [rad] and a gripper opening [m] to servo units (degrees.
 
-    openings: gripper openings [m], rising, (c,). percents: the gripper servo's positions at these, 0 to 100, (c,).
+    Gripper 0 to 100) and back.
+
+    openings: gripper openings [m], rising, (c,). percents: the gripper servo's positions at these,
+    0 to 100, (c,).
     """
 
     openings: F64
     percents: F64
 
     def of(self, arm: F64, opening: float) -> tuple[F64, float]:
-        """Return degrees (n - 1,) and gripper position, 0 to 100, for joints (n - 1,) [rad] and an opening [m]."""
+        """Return degrees (n - 1,) and gripper position, 0 to 100, for joints (n - 1,) [rad] and
+        an opening [m].
+        """
         return np.degrees(arm), float(np.interp(opening, self.openings, self.percents))
 
     def back(self, arm: F64, percent: float) -> tuple[F64, float]:
-        """Return joints (n - 1,) [rad] and opening [m] for degrees (n - 1,) and gripper position, 0 to 100."""
+        """Return joints (n - 1,) [rad] and opening [m] for degrees (n - 1,) and gripper
+        position, 0 to 100.
+        """
         order = np.argsort(self.percents)  # rising, as `interp` needs them
-        return np.radians(arm), float(np.interp(percent, self.percents[order], self.openings[order]))
+        return np.radians(arm), float(
+            np.interp(percent, self.percents[order], self.openings[order])
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class ActionSpace:
-    """Names and bounds of an action (n,): joint targets [rad] and, last in `names`, the gripper's opening [m].
+    """Names and bounds of an action (n,): joint targets [rad] and, last in `names`, the gripper's
+    opening [m].
 
-    low, high: what commands are clipped to, infinite for a joint that turns freely. scale: for a joint the largest step
-    of its target from its measured position [rad], for the gripper the range of its opening [m]. relative: whether a
-    learner's target is relative to the measured position: true except for the gripper. units: set for a robot with
-    servos; low, high, scale, actions and measured states are then in degrees, the gripper's from 0 to 100.
+    low, high: what commands are clipped to, infinite for a joint that turns freely. scale: for a
+    joint the largest step of its target from its measured position [rad], for the gripper the range
+    of its opening [m]. relative: whether a learner's target is relative to the measured position:
+    true except for the gripper. units: set for a robot with servos; low, high, scale, actions and
+    measured states are then in degrees, the gripper's from 0 to 100.
     """
 
     names: tuple[str, ...]
@@ -53,7 +64,9 @@ class ActionSpace:
         return len(self.names)
 
     def join(self, arm: F64, opening: float) -> F64:
-        """Return the action, or measured state, (n,) for joint values (n - 1,) [rad] and an opening [m]."""
+        """Return the action, or measured state, (n,) for joint values (n - 1,) [rad] and an
+        opening [m].
+        """
         if self.units is not None:
             arm, opening = self.units.of(arm, opening)
         action = np.empty(len(self.names))
@@ -67,16 +80,23 @@ class ActionSpace:
         return (arm, gripper) if self.units is None else self.units.back(arm, gripper)
 
     def clip(self, action: NDArray[np.floating], step: int) -> F64:
-        """Clip `action` (n,) to the bounds. Raises `MismatchError` for a wrong shape, `NotFiniteError` for NaN."""
+        """Clip `action` (n,) to the bounds.
+
+        Raises `MismatchError` for a wrong shape, `NotFiniteError` for NaN.
+        """
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self.low.shape:
-            raise MismatchError("action shape", "the policy", action.shape, "the robot", self.low.shape)
+            raise MismatchError(
+                "action shape", "the policy", action.shape, "the robot", self.low.shape
+            )
         if not np.isfinite(action).all():
             raise NotFiniteError(f"action at step {step} is not finite: {action}")
         return np.clip(action, self.low, self.high)
 
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
-        """Draw an action (n,): joint targets within `scale` of the measured `state` (n,), and any gripper opening."""
+        """Draw an action (n,): joint targets within `scale` of the measured `state` (n,), and
+        any gripper opening.
+        """
         action = np.array(state, dtype=np.float64)
         action[self.arm] += rng.uniform(-1, 1, len(action) - 1) * self.scale[self.arm]
         action[self.gripper] = rng.uniform(self.low[self.gripper], self.high[self.gripper])

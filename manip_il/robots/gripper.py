@@ -1,7 +1,9 @@
-"""A gripper, described by the opening [m] between its pads: the parts of the fingertips that face each other.
+"""A gripper, described by the opening [m] between its pads: the parts of the fingertips that face
+each other.
 
-A sweep relates command and opening: when a robot is first used, its gripper is moved from closed to open in steps, and
-the gap between the fingers is measured once they rest. Parallel, hinged and linked fingers are thus treated alike.
+A sweep relates command and opening: when a robot is first used, its gripper is moved from closed to
+open in steps, and the gap between the fingers is measured once they rest. Parallel, hinged and
+linked fingers are thus treated alike.
 """
 
 import bisect
@@ -23,8 +25,10 @@ TOUCH = 0.0015  # a finger this near to an object touches it [m]
 _COMMANDS = 15  # commands of the sweep from closed to open
 _SETTLE = 250  # physics steps at each command
 _STEP = 0.002  # [s]
-_PAD = 0.004  # a geom this much farther from the other finger than the nearest geom at the tip is no pad [m]
-_LOPSIDED = 0.004  # if only one of two fingers moves, the middle of the pads moves by more than this [m]
+# a geom this much farther from the other finger than the nearest geom at the tip is no pad [m]
+_PAD = 0.004
+# if only one of two fingers moves, the middle of the pads moves by more than this [m]
+_LOPSIDED = 0.004
 _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 
@@ -32,11 +36,12 @@ _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 class Sweep:
     """Measured relation between command and opening.
 
-    shares: how far the driven joints are, or are commanded to be, from closed (0) to open (1); rising, (c,).
-    openings: gaps between the pads at these [m], rising, (c,). middles: offsets along the hand's y of the midpoint
-    between the pads [m], (c,); all 0 if both sides move alike. pads: for each finger, the indices of its pads among its
-    geoms, nearest to the other finger first. holding: for each finger, the indices of the geoms that may hold an
-    object. linked: positions of a linkage's undriven joints, by name, (c,).
+    shares: how far the driven joints are, or are commanded to be, from closed (0) to open (1);
+    rising, (c,). openings: gaps between the pads at these [m], rising, (c,). middles: offsets along
+    the hand's y of the midpoint between the pads [m], (c,); all 0 if both sides move alike. pads:
+    for each finger, the indices of its pads among its geoms, nearest to the other finger first.
+    holding: for each finger, the indices of the geoms that may hold an object. linked: positions of
+    a linkage's undriven joints, by name, (c,).
     """
 
     shares: F64
@@ -48,23 +53,34 @@ class Sweep:
 
 
 class Gripper:
-    """A robot's gripper within a compiled model. prefix: prefix of the robot's names in the model."""
+    """A robot's gripper within a compiled model. prefix: prefix of the robot's names in the
+    model.
+    """
 
     def __init__(self, robot: Robot, model: mujoco.MjModel, prefix: str = ""):
         config, self._sweep = robot.gripper, sweep(robot)
-        self.q = np.array([model.joint(prefix + name).qposadr[0] for name in config.joints], dtype=np.int64)
-        self.ctrl = np.array([model.actuator(prefix + name).id for name in config.joints], dtype=np.int64)
+        self.q = np.array(
+            [model.joint(prefix + name).qposadr[0] for name in config.joints], dtype=np.int64
+        )
+        self.ctrl = np.array(
+            [model.actuator(prefix + name).id for name in config.joints], dtype=np.int64
+        )
         self._closed = np.asarray(config.closed)
         self._travel = np.subtract(config.open, config.closed)
-        weights = 1 / (self._travel * len(self._travel))  # of the joints in how far the gripper is open, 0 to 1
+        # of the joints in how far the gripper is open, 0 to 1
+        weights = 1 / (self._travel * len(self._travel))
         self._weights = tuple(zip(self.q.tolist(), weights.tolist(), strict=True))
         self._offset = float(weights @ self._closed)
         self._points = self._sweep.shares.tolist(), self._sweep.openings.tolist()
-        self._linked = [(model.joint(prefix + name).qposadr[0], at) for name, at in self._sweep.linked.items()]
+        self._linked = [
+            (model.joint(prefix + name).qposadr[0], at) for name, at in self._sweep.linked.items()
+        ]
         fingers = finger_geoms(model, config.fingers, prefix)
         self.geoms = frozenset(geom for finger in fingers for geom in finger)
         self.pads, self._holding = (
-            tuple(tuple(finger[i] for i in own) for finger, own in zip(fingers, places, strict=True))
+            tuple(
+                tuple(finger[i] for i in own) for finger, own in zip(fingers, places, strict=True)
+            )
             for places in (self._sweep.pads, self._sweep.holding)
         )
         self.lopsided = bool(self._sweep.middles.any())
@@ -86,32 +102,50 @@ class Gripper:
         return self._closed + float(np.interp(opening, openings, shares)) * self._travel
 
     def put(self, data: mujoco.MjData, opening: float) -> None:
-        """Place the fingers, with their linkage if there is one, at an opening [m], and command that opening."""
+        """Place the fingers, with their linkage if there is one, at an opening [m], and command
+        that opening.
+        """
         data.qpos[self.q] = data.ctrl[self.ctrl] = self.command(opening)
         for at, positions in self._linked:
             data.qpos[at] = np.interp(opening, self._sweep.openings, positions)
 
     @property
     def driven(self) -> tuple[F64, F64]:
-        """Openings [m], rising, and the first driven joint's positions at these [rad or m]; both (c,)."""
+        """Openings [m], rising, and the first driven joint's positions at these [rad or m].
+
+        Both (c,).
+        """
         return self._sweep.openings, self._closed[0] + self._sweep.shares * self._travel[0]
 
     def middle(self, opening: float) -> float:
-        """Return the offset [m] of the pads' midpoint along the hand's y at an opening [m]; 0 if all fingers move.
+        """Return the offset [m] of the pads' midpoint along the hand's y at an opening [m].
 
-        If one jaw is fixed and the other turns or slides, a held object ends up beside the fixed one.
+        0 if all fingers move.
+
+        If one jaw is fixed and the other turns or slides, a held object ends up beside the fixed
+        one.
         """
-        return float(np.interp(opening, self._sweep.openings, self._sweep.middles)) if self.lopsided else 0.0
+        return (
+            float(np.interp(opening, self._sweep.openings, self._sweep.middles))
+            if self.lopsided
+            else 0.0
+        )
 
     def commanded(self, commands: F64, before: F64) -> float:
-        """Return the opening [m] that `commands` (g,) ask for, by the one farthest from its value in `before` (g,)."""
+        """Return the opening [m] that `commands` (g,) ask for, by the one farthest from its
+        value in `before` (g,).
+        """
         shares = (commands - self._closed) / self._travel
         moved = np.abs(shares - (before - self._closed) / self._travel)
         return float(np.interp(shares[moved.argmax()], self._sweep.shares, self._sweep.openings))
 
     def touches(self, model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> bool:
-        """Return whether every finger touches a geom. Needs kinematics to be up to date in `data`."""
-        # For two separate boxes `mj_geomDistance` sometimes returns 0, but only if they are nearer than `TOUCH`.
+        """Return whether every finger touches a geom.
+
+        Needs kinematics to be up to date in `data`.
+        """
+        # For two separate boxes `mj_geomDistance` sometimes returns 0, but only if they are nearer
+        # than `TOUCH`.
         return all(
             any(mujoco.mj_geomDistance(model, data, pad, geom, TOUCH, None) < TOUCH for pad in pads)
             for pads in self._holding
@@ -140,7 +174,12 @@ def sweep(robot: Robot) -> Sweep:
         return [
             np.array(
                 [
-                    min(distance(model, data, geom, far) for other in groups if other is not own for far in other)
+                    min(
+                        distance(model, data, geom, far)
+                        for other in groups
+                        if other is not own
+                        for far in other
+                    )
                     for geom in own
                 ]
             )
@@ -153,7 +192,10 @@ def sweep(robot: Robot) -> Sweep:
         for finger in zip(fingers, gaps_at(poses[-1], fingers), strict=True)
     ]
     if not all(jaws):
-        raise UsageError(f"robot {robot.name}: the fingers touch when open; check gripper.open and gripper.fingers")
+        raise UsageError(
+            f"robot {robot.name}: the fingers touch when open; check gripper.open and"
+            " gripper.fingers"
+        )
     # Of these, the geoms near the tips; the links behind them may pass beside the other finger's.
     hand = data.site("ee")
     tips = [at_tip(model, data, jaw, hand.xmat.reshape(3, 3)[:, 2]) for jaw in jaws]
@@ -179,8 +221,8 @@ def sweep(robot: Robot) -> Sweep:
         raise UsageError(
             f"robot {robot.name}: the fingers stand {openings[0]:.4f} m apart when closed,"
             f" {openings[-1]:.4f} m when open, and go from {openings[place]:.4f} to"
-            f" {openings[place + 1]:.4f} m as {config.joints[0]} goes from {start:.3f} to {end:.3f};"
-            " expected the gap to grow all the way: check gripper.joints (undriven:"
+            f" {openings[place + 1]:.4f} m as {config.joints[0]} goes from {start:.3f} to"
+            f" {end:.3f}; expected the gap to grow all the way: check gripper.joints (undriven:"
             f" {', '.join(linked) or 'none'}), closed, open and fingers"
         )
     holding = jaws  # a turning jaw holds wide objects farther from its tip
@@ -195,11 +237,15 @@ def sweep(robot: Robot) -> Sweep:
 
 
 def set_time_step(spec: mujoco.MjSpec) -> None:
-    """Give a gripper that is simulated alone a time step and an integrator that stiff linkages bear."""
+    """Give a gripper that is simulated alone a time step and an integrator that stiff linkages
+    bear.
+    """
     spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 
-def _shares_at_rest(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData) -> tuple[list[float], list[F64]]:
+def _shares_at_rest(
+    robot: Robot, model: mujoco.MjModel, data: mujoco.MjData
+) -> tuple[list[float], list[F64]]:
     """For each command from closed to open, the share of the way that is reached, and `qpos`."""
     config = robot.gripper
     q = np.array([model.joint(name).qposadr[0] for name in config.joints])
@@ -220,11 +266,14 @@ def _near(gaps: F64, geoms: Sequence[int], least: float) -> list[int]:
     return [geoms[i] for i in np.argsort(gaps, kind="stable") if gaps[i] <= least + _PAD]
 
 
-def finger_geoms(model: mujoco.MjModel, fingers: Sequence[str], prefix: str = "") -> list[tuple[int, ...]]:
-    """Return for each finger the ids of the geoms with contacts on its body and that body's descendants.
+def finger_geoms(
+    model: mujoco.MjModel, fingers: Sequence[str], prefix: str = ""
+) -> list[tuple[int, ...]]:
+    """Return for each finger the ids of the geoms with contacts on its body and that body's
+    descendants.
 
-    A descendant that is another finger is left out. prefix: prefix of the bodies' names. Raises `UsageError` for a
-    finger without such a geom.
+    A descendant that is another finger is left out. prefix: prefix of the bodies' names. Raises
+    `UsageError` for a finger without such a geom.
     """
     owners = {model.body(prefix + name).id: place for place, name in enumerate(fingers)}
     for body in range(1, model.nbody):

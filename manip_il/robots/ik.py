@@ -25,16 +25,17 @@ _LARGEST = 0.5  # largest step of a joint in `moved` [rad]
 
 
 class PoseProgram:
-    """mink's quadratic program that moves a site to a pose and the joints towards `home`, within their limits.
+    """mink's quadratic program that moves a site to a pose and the joints towards `home`, within
+    their limits.
 
     With the twist e (6,) from the target to the site, its Jacobian J (6, n) and the costs W of its
     entries, the joint displacement dq (n,) minimises
 
         |W (J dq + e)|^2 + c^2 |q + dq - home|^2 + (d + m |W e|^2) |dq|^2
 
-    subject to g (low - q) <= dq <= g (high - q). c is the posture's cost, g mink's gain of joint limits,
-    d = 1e-5, m = 1e-3: the damping grows with the error, so that a singular or distant target gives a
-    short step (Sugihara 2011, IEEE Trans. Robotics 27, 984-991).
+    subject to g (low - q) <= dq <= g (high - q). c is the posture's cost, g mink's gain of joint
+    limits, d = 1e-5, m = 1e-3: the damping grows with the error, so that a singular or distant
+    target gives a short step (Sugihara 2011, IEEE Trans. Robotics 27, 984-991).
 
     Stateless: a solution depends only on the posture in `data`, after `update`, and on `home`.
 
@@ -42,19 +43,22 @@ class PoseProgram:
         model: The compiled arm.
         site: Name of the site that is moved.
         home: Joint positions, (n,) [rad].
-        costs: Cost of the rotation error [1/rad], relative to 1 [1/m] for the position error, and of a
-            joint's distance from `home` [1/rad].
+        costs: Cost of the rotation error [1/rad], relative to 1 [1/m] for the position error, and
+            of a joint's distance from `home` [1/rad].
     """
 
     def __init__(self, model: mujoco.MjModel, site: str, home: F64, costs: tuple[float, float]):
         self._configuration = mink.Configuration(model)
         self.model, self.data = model, self._configuration.data
         orientation, posture = costs
-        self.frame = mink.FrameTask(site, "site", _POSITION_COST, orientation, lm_damping=_LM_DAMPING)
+        self.frame = mink.FrameTask(
+            site, "site", _POSITION_COST, orientation, lm_damping=_LM_DAMPING
+        )
         # Overwritten by `solve`; all of mink's identities share one array.
         self._target = mink.SE3(mink.SE3.identity().wxyz_xyz.copy())
         self.frame.transform_target_to_world = self._target
-        self.posture = mink.PostureTask(model, posture)  # without it a label would depend on the path to the posture
+        # without it a label would depend on the path to the posture
+        self.posture = mink.PostureTask(model, posture)
         self.posture.set_target(home)
         limit = mink.ConfigurationLimit(model)
         self._bounded, self._gain = limit.indices.astype(int), limit.gain
@@ -69,19 +73,27 @@ class PoseProgram:
         mujoco.mj_comPos(self.model, self.data)
 
     def solve(self, position: F64, rotation: F64) -> F64 | None:
-        """Return a joint displacement (n,) [rad] towards a pose, (3,) [m] and (3, 3), or None if none is found."""
+        """Return a joint displacement (n,) [rad] towards a pose, (3,) [m] and (3, 3), or None if
+        none is found.
+        """
         mujoco.mju_mat2Quat(self._target.wxyz_xyz[:4], rotation.ravel())
         self._target.wxyz_xyz[4:] = position
-        program: Any = mink.build_ik(self._configuration, [self.frame, self.posture], 1.0, _DAMPING, [])
+        program: Any = mink.build_ik(
+            self._configuration, [self.frame, self.posture], 1.0, _DAMPING, []
+        )
         q = self.data.qpos[self._bounded]
         upper = self._gain * np.concatenate([self._high - q, q - self._low])
         # DAQP directly: with qpsolvers and mink's limits a label takes 1.5 times as long.
-        x, _, exit_flag, _ = daqp.solve(program.P, program.q, self._rows, upper, self._lower, self._sense)
+        x, _, exit_flag, _ = daqp.solve(
+            program.P, program.q, self._rows, upper, self._lower, self._sense
+        )
         return x if exit_flag > 0 else None
 
 
 class ArmIK:
-    """Inverse kinematics of an arm: a step depends only on the posture last given to `ee_pose` and on `home`."""
+    """Inverse kinematics of an arm: a step depends only on the posture last given to `ee_pose`
+    and on `home`.
+    """
 
     def __init__(self, robot: Robot):
         model = arm_model(robot)
@@ -90,11 +102,19 @@ class ArmIK:
         home[self._address] = robot.home
         self._site = model.site("ee").id
         self._costs = robot.costs
-        self._program = PoseProgram(model, "ee", home, (robot.costs.orientation, robot.costs.posture))
+        self._program = PoseProgram(
+            model, "ee", home, (robot.costs.orientation, robot.costs.posture)
+        )
         joints = [model.joint(name) for name in robot.joints]
-        self.limits = np.array([one.range if one.limited[0] else [-np.inf, np.inf] for one in joints])  # (arm, 2) [rad]
+        # (arm, 2) [rad]
+        self.limits = np.array(
+            [one.range if one.limited[0] else [-np.inf, np.inf] for one in joints]
+        )
         self._data = data = self._program.data  # views that follow the posture
-        self._ee, self._ee_rotation = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
+        self._ee, self._ee_rotation = (
+            data.site_xpos[self._site],
+            data.site_xmat[self._site].reshape(3, 3),
+        )
         self._qpos = data.qpos
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
         self._jacobian = np.zeros((6, model.nv))
@@ -106,23 +126,33 @@ class ArmIK:
         return yaw_ahead(self._robot, self._data.xanchor[self._shoulder], position)
 
     def smallest_singular_value(self, q: F64) -> float:
-        """Return the Jacobian's smallest singular value in a posture (arm,) [rad]: 0 if it is singular."""
+        """Return the Jacobian's smallest singular value in a posture (arm,) [rad]: 0 if it is
+        singular.
+        """
         self.ee_pose(q)
         return float(np.linalg.svd(self._site_jacobian(), compute_uv=False)[-1])
 
     def lowest_link(self, q: F64) -> float:
-        """Return the height [m] of the lowest link beyond the shoulder in a posture (arm,) [rad]."""
+        """Return the height [m] of the lowest link beyond the shoulder in a posture (arm,)
+        [rad].
+        """
         self.ee_pose(q)
         return float(self._data.xpos[self._links, 2].min()) if self._links else 0.0
 
     def ee_pose(self, q: F64) -> tuple[F64, F64]:
-        """Return position (3,) [m] and rotation matrix (3, 3) of `ee` in the world at `q` (arm,) [rad]."""
+        """Return position (3,) [m] and rotation matrix (3, 3) of `ee` in the world at `q` (arm,)
+        [rad].
+        """
         self._qpos[self._address] = q
         self._program.update()
         return self._ee.copy(), self._ee_rotation.copy()
 
-    def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
-        """Return only the displacement of `step`, (arm,) [rad]. weight: rotation cost, else `Costs.orientation`."""
+    def displacement(
+        self, position: F64, rotation: F64, largest: float, weight: float | None = None
+    ) -> F64 | None:
+        """Return only the displacement of `step`, (arm,) [rad]. weight: rotation cost, else
+        `Costs.orientation`.
+        """
         self._program.frame.cost[3:] = self._costs.orientation if weight is None else weight
         x = self._program.solve(position, rotation)
         if x is None:
@@ -131,8 +161,11 @@ class ArmIK:
         longest = max(map(abs, dq.tolist()))
         return dq * (largest / longest) if longest > largest else dq
 
-    def step(self, position: F64, rotation: F64, largest: float, lean: float = 0.0) -> tuple[F64, float] | None:
-        """Return one step towards a pose of `ee`, from the posture of the `ee_pose` call that must precede each step.
+    def step(
+        self, position: F64, rotation: F64, largest: float, lean: float = 0.0
+    ) -> tuple[F64, float] | None:
+        """Return one step towards a pose of `ee`, from the posture of the `ee_pose` call that must
+        precede each step.
 
         Args:
             position: Target of `ee` in the world, (3,) [m].
@@ -141,8 +174,9 @@ class ArmIK:
             lean: From 0 to 1, how far the hand may lean from the rotation to reach the position.
 
         Returns:
-            The joint displacement, (arm,) [rad], scaled down as a whole if one joint exceeds `largest`, and
-            the share of the weighted pose error that remains; None if the program has no solution.
+            The joint displacement, (arm,) [rad], scaled down as a whole if one joint exceeds
+            `largest`, and the share of the weighted pose error that remains; None if the program
+            has no solution.
         """
         costs = self._costs
         weight = costs.orientation + lean * (costs.leaning - costs.orientation)
@@ -157,18 +191,22 @@ class ArmIK:
         return dq, self._pose_error(position, rotation, weight) / before
 
     def moved(self, q: F64, motions: F64) -> F64:
-        """Return joints (B, arm) [rad], within their limits and near `q` (B, arm), that move `ee` by `motions`.
+        """Return joints (B, arm) [rad], within their limits and near `q` (B, arm), that move `ee`
+        by `motions`.
 
-        The first step is `displacement`, which resolves redundancy (the elbow of an arm with seven joints)
-        as for the expert. The corrections after it are damped least-squares steps,
-        dq = J^T (J J^T + 1e-8 I)^-1 e (Nakamura and Hanafusa 1986, J. Dyn. Sys. Meas. Control 108, 163-171).
+        The first step is `displacement`, which resolves redundancy (the elbow of an arm with seven
+        joints) as for the expert. The corrections after it are damped least-squares steps, dq = J^T
+        (J J^T + 1e-8 I)^-1 e (Nakamura and Hanafusa 1986, J. Dyn. Sys. Meas. Control 108, 163-171).
         A pose out of reach is only approached.
 
         Args:
             q: Measured joints, (B, arm) [rad].
-            motions: Translations [m] and rotation vectors [rad] of `ee` in the world's axes, (B, 6).
+            motions: Translations [m] and rotation vectors [rad] of `ee` in the world's axes, (B,
+                6).
         """
-        return np.array([self._moved(*row) for row in zip(q, motions, strict=True)]).reshape(q.shape)
+        return np.array([self._moved(*row) for row in zip(q, motions, strict=True)]).reshape(
+            q.shape
+        )
 
     def _moved(self, q: F64, motion: F64) -> F64:
         position, rotation = self.ee_pose(q)
@@ -186,12 +224,16 @@ class ArmIK:
         return q
 
     def _site_jacobian(self) -> F64:
-        """Jacobian of `ee` by the arm's joints, rows for position first, in the last `ee_pose` posture; (6, arm)."""
+        """Jacobian of `ee` by the arm's joints, rows for position first, in the last `ee_pose`
+        posture; (6, arm).
+        """
         jacobian = self._jacobian
         mujoco.mj_jacSite(self._program.model, self._data, jacobian[:3], jacobian[3:], self._site)
         return jacobian[:, self._dofs]
 
     def _pose_error(self, position: F64, rotation: F64, weight: float) -> float:
-        """Pose error [m], weighted as by the frame task: position by 1, angle by `weight` [m/rad]."""
+        """Pose error [m], weighted as by the frame task: position by 1, angle by `weight`
+        [m/rad].
+        """
         dx, dy, dz = (self._ee - position).tolist()
         return math.hypot(dx, dy, dz, weight * angle_between(self._ee_rotation, rotation))

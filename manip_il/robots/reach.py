@@ -1,7 +1,8 @@
 """A map of the points that a robot's downward hand reaches by inverse kinematics.
 
-It is computed once per robot and stored. A robot that ships with the package has it beside its YAML; any other has it
-in the user's cache, under a hash of the compiled model and the rest of the YAML.
+It is computed once per robot and stored. A robot that ships with the package has it beside its
+YAML; any other has it in the user's cache, under a hash of the compiled model and the rest of the
+YAML.
 """
 
 from __future__ import annotations
@@ -23,7 +24,14 @@ from manip_il.checks import open_outside, without_link
 from manip_il.mdp import F64
 from manip_il.robots import HERE, ROBOTS
 from manip_il.robots.files import ModelFiles
-from manip_il.robots.geometry import CLEARANCE, Body, angle_between, angle_off_vertical, hand_down, off_yaw
+from manip_il.robots.geometry import (
+    CLEARANCE,
+    Body,
+    angle_between,
+    angle_off_vertical,
+    hand_down,
+    off_yaw,
+)
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_spec, model_bytes
 from manip_il.robots.table import get_robot
@@ -36,7 +44,8 @@ _BEYOND = 0.3  # how far the map extends around the workspace [m]
 _ABOVE = 0.05  # how far the map extends above the workspace [m]
 _VERSION = 2  # version of the map's computation
 _STEPS = 80  # most steps of inverse kinematics
-_NEAR, _ANGLE = 1e-3, 0.05  # pose error that counts as converged [m]; what a radian adds to it [m/rad]
+# pose error that counts as converged [m]; what a radian adds to it [m/rad]
+_NEAR, _ANGLE = 1e-3, 0.05
 ARRIVES = 0.004  # pose error below which the hand counts as arrived [m]
 STRETCH = 0.02  # pose error below which the hand counts as near [m]
 _LEAN = 0.13  # how much farther sideways a leaning hand reaches [m]
@@ -48,8 +57,8 @@ _BLOCKED = 0.1  # error added for a posture in which the robot collides with its
 class Reach:
     """A grid of points and an error for each: how far from the point the downward hand ends up.
 
-    Eight neighbouring points are the corners of a cell. origin: the grid's first point, (3,) [m]. errors: [m], an array
-    with the axes x, y and z.
+    Eight neighbouring points are the corners of a cell. origin: the grid's first point, (3,) [m].
+    errors: [m], an array with the axes x, y and z.
     """
 
     origin: F64
@@ -72,7 +81,9 @@ class Reach:
         return self.origin.tolist()
 
     def error(self, position: Sequence[float] | F64) -> float:
-        """Return how far from `position` (3,) [m] the hand ends up [m], plus how far `position` is outside the map."""
+        """Return how far from `position` (3,) [m] the hand ends up [m], plus how far `position`
+        is outside the map.
+        """
         place = (np.asarray(position) - self.origin) / _CELL
         last = np.array(self.errors.shape) - 1
         inside = np.minimum(np.maximum(place, 0.0), last)
@@ -81,10 +92,14 @@ class Reach:
         block = self.errors[x : x + 2, y : y + 2, z : z + 2]
         block = block[0] + fx * (block[1] - block[0])
         block = block[0] + fy * (block[1] - block[0])
-        return float(block[0] + fz * (block[1] - block[0])) + _CELL * float(np.abs(place - inside).max())
+        return float(block[0] + fz * (block[1] - block[0])) + _CELL * float(
+            np.abs(place - inside).max()
+        )
 
     def has(self, position: Sequence[float] | F64) -> bool:
-        """Return whether the hand reaches all corners of the map's cell that contains `position` (3,) [m]."""
+        """Return whether the hand reaches all corners of the map's cell that contains `position`
+        (3,) [m].
+        """
         cells = self._arrives
         x, y, z = position
         first_x, first_y, first_z = self._corner
@@ -101,11 +116,15 @@ class Reach:
         return inside & self.arrives[tuple(index.clip(0, last).T)]
 
     def nearly(self, position: Sequence[float] | F64) -> bool:
-        """Return whether the hand gets near `position` [m], (3,): close enough for a label to make sense."""
+        """Return whether the hand gets near `position` [m], (3,): close enough for a label to
+        make sense.
+        """
         return self.has(position) or self.error(position) < STRETCH
 
     def lean(self, position: Sequence[float] | F64) -> float:
-        """Return how much the hand must lean to reach `position` [m], (3,), from 0 (pointing down) to 1."""
+        """Return how much the hand must lean to reach `position` [m], (3,), from 0 (pointing
+        down) to 1.
+        """
         if self.has(position):
             return 0.0
         return min(1.0, max(0.0, (self.error(position) - ARRIVES) / (STRETCH - ARRIVES)))
@@ -113,20 +132,27 @@ class Reach:
     def leaning(self, position: Sequence[float] | F64) -> bool:
         """Return whether a hand that may lean gets near `position` (3,) [m], by a rule of thumb.
 
-        The downward hand must get near it, or near the point up to 13 cm closer, horizontally, to the map's centre.
+        The downward hand must get near it, or near the point up to 13 cm closer, horizontally, to
+        the map's centre.
         """
         if self.nearly(position):
             return True
-        (x, y, z), (in_x, in_y, _) = position, (self.origin + _CELL / 2 * (np.array(self.errors.shape) - 1)).tolist()
+        (x, y, z), (in_x, in_y, _) = (
+            position,
+            (self.origin + _CELL / 2 * (np.array(self.errors.shape) - 1)).tolist(),
+        )
         inwards = _LEAN / max(_LEAN, math.hypot(in_x - x, in_y - y))
         return self.nearly((x + inwards * (in_x - x), y + inwards * (in_y - y), z))
 
 
 @cache
 def reach_of(robot: Robot) -> Reach:
-    """Return a robot's map: read from its file, else computed (some seconds) and stored if possible."""
+    """Return a robot's map: read from its file, else computed (some seconds) and stored if
+    possible.
+    """
     path = _place(robot)
-    with contextlib.suppress(Exception), open_outside(path, "a map") as file:  # other files raise many kinds of errors
+    # other files raise many kinds of errors
+    with contextlib.suppress(Exception), open_outside(path, "a map") as file:
         kept = np.load(file)
         return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
     reach, partial = _solve(robot), path.with_suffix(f".{os.getpid()}")
@@ -147,16 +173,20 @@ def _place(robot: Robot) -> Path:
 
 
 def _key(robot: Robot) -> str:
-    """Hash what a map depends on: the constants of this file, the YAML, and the robot's model as it is compiled."""
+    """Hash what a map depends on: the constants of this file, the YAML, and the robot's model as
+    it is compiled.
+    """
     constants = (_VERSION, _CELL, _BEYOND, _ABOVE, _STEPS, _NEAR, _ANGLE, _BLOCKED, CLEARANCE)
     compiled = model_bytes(arm_spec(robot).compile())
-    said = replace(robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None))  # paths do not count
+    # paths do not count
+    said = replace(robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None))
     return hashlib.sha256(repr((constants, said)).encode() + compiled).hexdigest()[:16]
 
 
 def _solve(robot: Robot) -> Reach:
     """Compute the map: how far from every point of the grid the hand ends."""
-    from manip_il.robots.ik import ArmIK  # mink is slow to import, and a stored map does not need it
+    # mink is slow to import, and a stored map does not need it
+    from manip_il.robots.ik import ArmIK
 
     ik = ArmIK(robot)
     body = Body(robot)
@@ -174,7 +204,8 @@ def _solve(robot: Robot) -> Reach:
 
 
 def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
-    """Return the pose error [m] at which inverse kinematics from home stops, and its last joints, (arm,) [rad].
+    """Return the pose error [m] at which inverse kinematics from home stops, and its last joints,
+    (arm,) [rad].
 
     The error includes the angle, converted to a length.
     """

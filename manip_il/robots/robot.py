@@ -1,4 +1,6 @@
-"""A robot, an arm with a gripper, as dataclasses: one per section of its YAML, which names parts of its MJCF."""
+"""A robot, an arm with a gripper, as dataclasses: one per section of its YAML, which names parts
+of its MJCF.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,22 +13,25 @@ from manip_il.errors import ManipError, UnknownName
 from manip_il.mdp import F64
 from manip_il.robots.files import ModelFiles, require_lengths
 
-TABLE_BEYOND = 0.08  # offset of the table's middle from the workspace's middle, away from the robot [m]
+# offset of the table's middle from the workspace's middle, away from the robot [m]
+TABLE_BEYOND = 0.08
 RATE = 20  # default control steps per second
 GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
 JOINT_STEP = 0.1  # largest step of a joint target from the measured position [rad]
-FOUND = ("home", "gains", "forces", "armature", "ee")  # found in the model if the YAML does not give them
+# found in the model if the YAML does not give them
+FOUND = ("home", "gains", "forces", "armature", "ee")
 YAWS = ("world", "shoulder")
-WRIST_CAMERA = (0.10, 0.0, -0.08)  # beside the hand and behind the fingertips, in the frame `ee` [m]
+# beside the hand and behind the fingertips, in the frame `ee` [m]
+WRIST_CAMERA = (0.10, 0.0, -0.08)
 
 
 @dataclass(frozen=True)
 class EndEffector:
     """Frame `ee`: between the fingertips, z out of the hand, y along the fingers' motion.
 
-    With the hand straight down at zero yaw, its axes are the world's x, -y, -z. position [m], quaternion (wxyz): its
-    pose in `body`.
-    lowest: least height of the frame over the table, at which the fingertips just clear it [m].
+    With the hand straight down at zero yaw, its axes are the world's x, -y, -z. position [m],
+    quaternion (wxyz): its pose in `body`. lowest: least height of the frame over the table, at
+    which the fingertips just clear it [m].
     """
 
     body: str
@@ -37,11 +42,13 @@ class EndEffector:
 
 @dataclass(frozen=True)
 class GripperConfig:
-    """The driven joints, their positions when the gripper is closed and open, and the bodies that touch objects.
+    """The driven joints, their positions when the gripper is closed and open, and the bodies that
+    touch objects.
 
-    closed, open: [m] if a joint slides, [rad] if it turns. finger_mass: replaces every finger's mass [kg]. force: limit
-    of a driven joint, by default 40 N if it slides and 10 N m if it turns. files: the gripper's own model, if any; its
-    names then begin with `gripper/`. position [m], quaternion (wxyz): the gripper's pose in the hand's body.
+    closed, open: [m] if a joint slides, [rad] if it turns. finger_mass: replaces every finger's
+    mass [kg]. force: limit of a driven joint, by default 40 N if it slides and 10 N m if it turns.
+    files: the gripper's own model, if any; its names then begin with `gripper/`. position [m],
+    quaternion (wxyz): the gripper's pose in the hand's body.
     """
 
     joints: tuple[str, ...]
@@ -62,7 +69,9 @@ class GripperConfig:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Volume in which tasks take place: within half_width of the centre along x and y, `height` above the table [m]."""
+    """Volume in which tasks take place: within half_width of the centre along x and y, `height`
+    above the table [m].
+    """
 
     centre: tuple[float, float]
     half_width: float = 0.15
@@ -70,7 +79,9 @@ class Workspace:
 
     def __post_init__(self) -> None:
         if not 0.02 <= min(self.half_width, self.height) <= max(self.half_width, self.height) <= 2:
-            raise ManipError(f"half_width is {self.half_width:g}, height {self.height:g}; expected 0.02 to 2 m")
+            raise ManipError(
+                f"half_width is {self.half_width:g}, height {self.height:g}; expected 0.02 to 2 m"
+            )
 
 
 @dataclass(frozen=True)
@@ -83,9 +94,11 @@ class TableTop:
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Position of a camera and its target in the world, (3,) [m], and its vertical field of view [deg].
+    """Position of a camera and its target in the world, (3,) [m], and its vertical field of view
+    [deg].
 
-    z = 0 is the table's top, x points away from the robot. If the camera looks straight down, x is up in its picture.
+    z = 0 is the table's top, x points away from the robot. If the camera looks straight down, x is
+    up in its picture.
     """
 
     position: tuple[float, float, float]
@@ -98,9 +111,15 @@ class CameraPose:
         back = np.subtract(self.position, self.target)
         back = back / np.linalg.norm(back)
         right = np.cross([0.0, 0.0, 1.0], back)
-        right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([0.0, -1.0, 0.0])
+        right = (
+            right / np.linalg.norm(right)
+            if np.linalg.norm(right) > 1e-6
+            else np.array([0.0, -1.0, 0.0])
+        )
         quaternion = np.zeros(4)
-        mujoco.mju_mat2Quat(quaternion, np.stack([right, np.cross(back, right), back], axis=1).flatten())
+        mujoco.mju_mat2Quat(
+            quaternion, np.stack([right, np.cross(back, right), back], axis=1).flatten()
+        )
         return tuple(quaternion.tolist())
 
 
@@ -108,8 +127,8 @@ class CameraPose:
 class Costs:
     """Costs of inverse kinematics, relative to 1 per metre of position error.
 
-    orientation: per radian of rotation error; leaning: the same for a hand that leans to reach farther; posture: per
-    radian of a joint's distance from home.
+    orientation: per radian of rotation error; leaning: the same for a hand that leans to reach
+    farther; posture: per radian of a joint's distance from home.
     """
 
     orientation: float = 0.2
@@ -121,8 +140,9 @@ class Costs:
 class LeRobotConfig:
     """A robot as LeRobot's recorder knows it.
 
-    robot_type: as in `meta/info.json`. names: servo names, the arm's from base to hand, then the gripper's. gripper:
-    positions of the gripper's driven joint at 0 and at 100 [rad]. fps: frames per second.
+    robot_type: as in `meta/info.json`. names: servo names, the arm's from base to hand, then the
+    gripper's. gripper: positions of the gripper's driven joint at 0 and at 100 [rad]. fps: frames
+    per second.
     """
 
     robot_type: str
@@ -133,31 +153,39 @@ class LeRobotConfig:
     def __post_init__(self) -> None:
         checks.name("robot_type", self.robot_type)
         if len(set(self.gripper)) != 2:
-            raise ManipError(f"gripper is {list(self.gripper)}; expected different joint positions [rad] for 0 and 100")
+            raise ManipError(
+                f"gripper is {list(self.gripper)}; expected different joint positions [rad] for 0"
+                " and 100"
+            )
 
     def percent(self, joint: F64) -> F64:
-        """Return the gripper's positions, 0 to 100, for positions `joint` of its driven joint [rad]."""
+        """Return the gripper's positions, 0 to 100, for positions `joint` of its driven joint
+        [rad].
+        """
         at_0, at_100 = self.gripper
         return 100 * (joint - at_0) / (at_100 - at_0)
 
 
 UPRIGHT = Costs()
-SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)  # for an arm whose hand leans everywhere
+# for an arm whose hand leans everywhere
+SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)
 
 
 @dataclass(frozen=True)
 class Robot:
     """A joint-position-controlled arm with a gripper.
 
-    hand: body that carries the gripper. joints: the arm's, base to hand. home: a posture over the workspace with
-    the hand down [rad]. gains, forces, armature: each joint's kp [N m/rad], greatest torque [N m] and added inertia
-    [kg m^2]. base: position of the root body [m]. fixed: positions of the joints that are neither the arm's nor the
-    gripper's [rad or m]. max_joint_step: largest step of a joint target from the measured position [rad]. costs:
-    of inverse kinematics. yaw: where zero yaw points: along the world's x (world) or away from the shoulder (shoulder).
-    wrist_camera: name of the model's camera on its hand, or position of an added one in the frame `ee` [m]. cameras:
-    poses of the scene's cameras, front and side, that replace the default ones. table: the scene's table.
-    colours: red, green and blue of meshes without contacts, by patterns of their names; later patterns win. lerobot:
-    how LeRobot's recorder writes the robot; its servos' units then replace [rad] and [m].
+    hand: body that carries the gripper. joints: the arm's, base to hand. home: a posture over the
+    workspace with the hand down [rad]. gains, forces, armature: each joint's kp [N m/rad], greatest
+    torque [N m] and added inertia [kg m^2]. base: position of the root body [m]. fixed: positions
+    of the joints that are neither the arm's nor the gripper's [rad or m]. max_joint_step: largest
+    step of a joint target from the measured position [rad]. costs: of inverse kinematics. yaw:
+    where zero yaw points: along the world's x (world) or away from the shoulder (shoulder).
+    wrist_camera: name of the model's camera on its hand, or position of an added one in the frame
+    `ee` [m]. cameras: poses of the scene's cameras, front and side, that replace the default ones.
+    table: the scene's table. colours: red, green and blue of meshes without contacts, by patterns
+    of their names; later patterns win. lerobot: how LeRobot's recorder writes the robot; its
+    servos' units then replace [rad] and [m].
     """
 
     name: str
@@ -186,13 +214,18 @@ class Robot:
         count = len(self.joints)
         require_lengths(self, home=count, gains=count, forces=count, armature=count)
         if (named := len(self.joint_names)) != count + 1:
-            raise ManipError(f"lerobot.names has {named} names; expected {count + 1}: the arm's, then the gripper's")
+            raise ManipError(
+                f"lerobot.names has {named} names; expected {count + 1}: the arm's, then the"
+                " gripper's"
+            )
         if self.yaw not in YAWS:
             raise UnknownName("yaw", self.yaw, YAWS)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the entries of `observation.state` and `action`: arm joints, then the gripper."""
+        """Names of the entries of `observation.state` and `action`: arm joints, then the
+        gripper.
+        """
         return self.lerobot.names if self.lerobot is not None else (*self.joints, "gripper")
 
     @property
@@ -202,10 +235,14 @@ class Robot:
 
     @property
     def faces_ahead(self) -> bool:
-        """Whether yaw 0 of the hand points away from the shoulder, rather than along the world's x."""
+        """Whether yaw 0 of the hand points away from the shoulder, rather than along the world's
+        x.
+        """
         return self.yaw != "world"
 
     @property
     def leans(self) -> bool:
-        """Whether the hand leans everywhere, as the arm has too few joints to point it straight down."""
+        """Whether the hand leans everywhere, as the arm has too few joints to point it straight
+        down.
+        """
         return self.costs.orientation == self.costs.leaning

@@ -1,4 +1,6 @@
-"""A robot's model as an `MjSpec`: with position control and the site `ee`, without what belongs to a scene."""
+"""A robot's model as an `MjSpec`: with position control and the site `ee`, without what belongs
+to a scene.
+"""
 
 import fnmatch
 import itertools
@@ -13,7 +15,8 @@ from manip_il.mdp import F64
 from manip_il.robots.files import ModelFiles
 from manip_il.robots.robot import GRIPPER, GripperConfig, Robot
 
-PLAIN = mujoco.MjSpec()  # defaults for what we add to a model, because its own defaults may set a material or a range
+# defaults for what we add to a model, because its own defaults may set a material or a range
+PLAIN = mujoco.MjSpec()
 _KV_PER_KP = 1 / 20  # [s]: a time constant of one control step at 20 Hz
 _DAMPING = 1.0  # damping of an arm joint [N m s/rad]
 _FINGER_GAINS = (800.0, 20.0, 40.0)  # kp [N/m], kv [N s/m], force [N] of a sliding finger
@@ -22,8 +25,10 @@ _FINGER_ARMATURE, _FINGER_DAMPING = 0.2, 10.0  # [kg], [N s/m]
 _LINK_ARMATURE, _LINK_DAMPING = 0.001, 0.02  # for a linkage's joint [kg m^2], [N m s/rad]
 _HINGE_ARMATURE, _HINGE_DAMPING = 0.005, 0.1  # [kg m^2], [N m s/rad]
 WRIST = "wrist"  # the camera on the hand
-_TILT, _FOVY = 0.45, 70.0  # added wrist camera: tilt towards the fingertips [rad], vertical field of view [deg]
-_OF_A_SCENE = ("fusestatic", "discardvisual", "settotalmass", "alignfree", "saveinertial")  # compiler options
+# added wrist camera: tilt towards the fingertips [rad], vertical field of view [deg]
+_TILT, _FOVY = 0.45, 70.0
+# compiler options
+_OF_A_SCENE = ("fusestatic", "discardvisual", "settotalmass", "alignfree", "saveinertial")
 _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
@@ -46,24 +51,31 @@ def joint_range(joint: Any) -> F64:
 
 
 def _turn_inertias(spec: mujoco.MjSpec) -> None:
-    """Replace inertia tensors of a URDF by principal moments, as MuJoCo does but without their origin's rotation.
+    """Replace inertia tensors of a URDF by principal moments, as MuJoCo does but without their
+    origin's rotation.
 
-    Its reader gives `iquat`, the axes with that rotation, which its compiler replaces by the tensor's own axes.
+    Its reader gives `iquat`, the axes with that rotation, which its compiler replaces by the
+    tensor's own axes.
     """
     for body in spec.bodies:
         tensor = np.array(body.fullinertia)  # xx, yy, zz, xy, xz, yz
-        if np.isnan(tensor).any() or tuple(body.iquat) == (1, 0, 0, 0):  # no tensor, or one of an MJCF
+        # no tensor, or one of an MJCF
+        if np.isnan(tensor).any() or tuple(body.iquat) == (1, 0, 0, 0):
             continue
         moments = np.zeros(3)
         mujoco.mju_eig3(moments, np.zeros(9), np.zeros(4), tensor[[0, 3, 4, 3, 1, 5, 4, 5, 2]])
         body.inertia, body.fullinertia = moments, np.full(6, np.nan)
 
 
-def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:
-    """Return a robot's model without what belongs to a scene; a gripper with its own model is attached to the hand.
+def bare_spec(
+    robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = ""
+) -> mujoco.MjSpec:
+    """Return a robot's model without what belongs to a scene.
 
-    robot: its name. camera: name of the camera on the hand, kept as `wrist`.
-    Raises `UsageError` naming the file that MuJoCo cannot read, or the body or camera that is missing.
+    A gripper with its own model is attached to the hand.
+
+    robot: its name. camera: name of the camera on the hand, kept as `wrist`. Raises `UsageError`
+    naming the file that MuJoCo cannot read, or the body or camera that is missing.
     """
     spec = load(files, robot)
     require(robot, "body", (hand,), spec.bodies)
@@ -93,12 +105,15 @@ def arm_joints(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig)
         joints[:0] = [one.name for one in hinges if one.name not in gripper.joints]
         body = body.parent
     if not joints:
-        raise UsageError(f"robot {robot}: there is no hinge between the base and hand {hand!r}; check hand")
+        raise UsageError(
+            f"robot {robot}: there is no hinge between the base and hand {hand!r}; check hand"
+        )
     return tuple(joints)
 
 
 def arm_spec(robot: Robot) -> mujoco.MjSpec:
-    """Return the arm and gripper as a spec: position-controlled, with the site `ee`, and nothing else.
+    """Return the arm and gripper as a spec: position-controlled, with the site `ee`, and nothing
+    else.
 
     Raises `UsageError` naming the joint, body or file that is missing, and those that exist.
     """
@@ -128,7 +143,8 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
 
 
 def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, place: Sequence[float]) -> None:
-    """Add the camera `wrist` to an arm, at a place (3,) [m] in the frame `ee`, tilted towards the fingertips.
+    """Add the camera `wrist` to an arm, at a place (3,) [m] in the frame `ee`, tilted towards the
+    fingertips.
 
     model: the compiled arm. The camera looks along its -z, and its x is parallel to the hand's y.
     """
@@ -143,7 +159,9 @@ def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, place: Sequence
     rotation = rotation.reshape(3, 3)
     mujoco.mju_mat2Quat(quat, (rotation @ axes).flatten())
     hand: Any = spec.site("ee")
-    hand.parent.add_camera(PLAIN.default, name=WRIST, pos=site.pos + rotation @ np.array(place), quat=quat, fovy=_FOVY)
+    hand.parent.add_camera(
+        PLAIN.default, name=WRIST, pos=site.pos + rotation @ np.array(place), quat=quat, fovy=_FOVY
+    )
 
 
 def arm_model(robot: Robot) -> mujoco.MjModel:
@@ -169,7 +187,9 @@ def model_bytes(model: mujoco.MjModel) -> bytes:
 
 
 def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -> None:
-    """Raise `UnknownName` for a name that no element in `there` has. kind: what the elements are, such as joint."""
+    """Raise `UnknownName` for a name that no element in `there` has. kind: what the elements
+    are, such as joint.
+    """
     known = [one.name for one in there if one.name and one.name != "world"]
     for name in names:
         if name not in known:
@@ -177,10 +197,14 @@ def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -
 
 
 def linkage(spec: mujoco.MjSpec, robot: Robot) -> list[str]:
-    """Return the names of the joints beyond the hand that nothing drives or fixes: those of the gripper's linkage."""
+    """Return the names of the joints beyond the hand that nothing drives or fixes: those of the
+    gripper's linkage.
+    """
     apart = {*robot.joints, *robot.gripper.joints, *robot.fixed}
     below = spec.body(robot.hand).find_all("joint")
-    return [joint.name for joint in below if joint.parent.name != robot.hand and joint.name not in apart]
+    return [
+        joint.name for joint in below if joint.parent.name != robot.hand and joint.name not in apart
+    ]
 
 
 def _keep_links_apart(spec: mujoco.MjSpec, hand: str) -> None:
@@ -196,10 +220,14 @@ def _keep_links_apart(spec: mujoco.MjSpec, hand: str) -> None:
 
 
 def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> None:
-    """Delete joints that are neither the arm's nor the gripper's, leaving their bodies where the YAML says."""
+    """Delete joints that are neither the arm's nor the gripper's, leaving their bodies where the
+    YAML says.
+    """
     kept = {*robot.joints, *robot.gripper.joints, *linked}
     loose = [joint for joint in spec.joints if joint.name not in kept]
-    require(robot.name, "joint", tuple(robot.fixed), [joint for joint in loose if joint.type in _SCALAR])
+    require(
+        robot.name, "joint", tuple(robot.fixed), [joint for joint in loose if joint.type in _SCALAR]
+    )
     if robot.fixed:
         _place_bodies(spec, robot.fixed)
     for equality in list(spec.equalities):
@@ -222,7 +250,9 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
 
 
 def _coupled(spec: mujoco.MjSpec, equality: mujoco._specs.MjsEquality) -> set[str]:
-    """The names of the joints that an equality of joints names, or that move one of its bodies against the other."""
+    """The names of the joints that an equality of joints names, or that move one of its bodies
+    against the other.
+    """
     ends = equality.name1, equality.name2
     if equality.type == mujoco.mjtEq.mjEQ_JOINT:
         return set(filter(None, ends))
@@ -250,7 +280,8 @@ def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
         if not fixed.keys() & {joint.name for joint in body.joints}:
             continue
         place, turn = data.xpos[there.id], data.xmat[there.id].reshape(3, 3)
-        for joint, own in zip(body.joints, there.joints, strict=True):  # kept joints keep axis and anchor
+        # kept joints keep axis and anchor
+        for joint, own in zip(body.joints, there.joints, strict=True):
             joint.axis, joint.pos = data.xaxis[own.id] @ turn, (data.xanchor[own.id] - place) @ turn
         body.set_frame(body.parent.add_frame())
         body.pos, body.quat = place, data.xquat[there.id]
@@ -260,7 +291,8 @@ def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
 def _remove_scene_elements(spec: mujoco.MjSpec, hand: str = "", kept: str = "") -> None:
     """Delete what belongs to a scene: motors, mocap bodies, sky, cameras, gravity and time step.
 
-    hand: if given, all that is not in this body's tree also belongs to the scene: a floor, a table, what lies on it.
+    hand: if given, all that is not in this body's tree also belongs to the scene: a floor, a table,
+    what lies on it.
     """
     for element in _scene_elements(spec, hand, kept):
         spec.delete(element)
@@ -271,26 +303,38 @@ def _remove_scene_elements(spec: mujoco.MjSpec, hand: str = "", kept: str = "") 
 
 
 def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
-    """Copy physics options from one spec to another: MuJoCo warns if two specs that it joins have different ones."""
+    """Copy physics options from one spec to another: MuJoCo warns if two specs that it joins
+    have different ones.
+    """
     for name in dir(origin.option):
         if not name.startswith("_"):
             setattr(spec.option, name, getattr(origin.option, name))
 
 
 def _scene_elements(spec: mujoco.MjSpec, hand: str, kept: str) -> Iterator[Any]:
-    """Yield what to delete; each kind is looked up at its turn, as MuJoCo deletes what depends on a body, too."""
+    """Yield what to delete.
+
+    Each kind is looked up at its turn, as MuJoCo deletes what depends on a body, too.
+    """
     yield from list(spec.keys)
     yield from [body for body in spec.bodies if body.mocap]
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    yield from [geom for geom in spec.geoms if geom.type == plane or (hand and geom.parent.name == "world")]
+    yield from [
+        geom for geom in spec.geoms if geom.type == plane or (hand and geom.parent.name == "world")
+    ]
     geoms, site = {geom.name for geom in spec.geoms}, mujoco.mjtObj.mjOBJ_SITE
     yield from [pair for pair in spec.pairs if not {pair.geomname1, pair.geomname2} <= geoms]
     yield from [equality for equality in spec.equalities if equality.objtype == site]
-    trees = [(body, {one.name for one in (body, *body.find_all("body"))}) for body in spec.worldbody.bodies]
+    trees = [
+        (body, {one.name for one in (body, *body.find_all("body"))})
+        for body in spec.worldbody.bodies
+    ]
     yield from [body for body, names in trees if hand and hand not in names]
     used = {name for material in spec.materials for name in material.textures}
     sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX
-    yield from [texture for texture in spec.textures if texture.type == sky or texture.name not in used]
+    yield from [
+        texture for texture in spec.textures if texture.type == sky or texture.name not in used
+    ]
     yield from [camera for camera in spec.cameras if not kept or camera.name != kept]
     for kind in ("actuators", "sensors", "lights", "sites", "tuples"):
         yield from list(getattr(spec, kind))
@@ -299,13 +343,19 @@ def _scene_elements(spec: mujoco.MjSpec, hand: str, kept: str) -> Iterator[Any]:
 def _paint(robot: Robot, spec: mujoco.MjSpec) -> None:
     for geom in spec.geoms:
         for pattern, colour in robot.colours.items():
-            if geom.meshname and fnmatch.fnmatch(geom.meshname, pattern) and not (geom.contype or geom.conaffinity):
+            if (
+                geom.meshname
+                and fnmatch.fnmatch(geom.meshname, pattern)
+                and not (geom.contype or geom.conaffinity)
+            ):
                 geom.rgba = np.array([*colour, 1.0])
 
 
 def _motorise(robot: Robot, spec: mujoco.MjSpec) -> None:
     """Give the joints of arm and gripper position control in place of the model's motors."""
-    for name, kp, force, armature in zip(robot.joints, robot.gains, robot.forces, robot.armature, strict=True):
+    for name, kp, force, armature in zip(
+        robot.joints, robot.gains, robot.forces, robot.armature, strict=True
+    ):
         joint = spec.joint(name)
         joint.damping = np.array([_DAMPING, 0, 0])
         joint.stiffness = np.zeros(3)
@@ -327,9 +377,13 @@ def _motorise(robot: Robot, spec: mujoco.MjSpec) -> None:
 
 
 def _position_actuator(spec: mujoco.MjSpec, joint: Any, gains: tuple[float, float, float]) -> None:
-    """Add PD position control of one joint: force = kp (ctrl - q) - kv v, within +-force [N or N m]."""
+    """Add PD position control of one joint: force = kp (ctrl - q) - kv v, within +-force [N or N
+    m].
+    """
     kp, kv, force = gains
-    actuator = spec.add_actuator(PLAIN.default, name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator = spec.add_actuator(
+        PLAIN.default, name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+    )
     actuator.set_to_position(kp=kp, kv=kv)
     actuator.forcelimited, actuator.forcerange = True, [-force, force]
     if joint.range[0] < joint.range[1]:

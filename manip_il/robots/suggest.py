@@ -1,4 +1,6 @@
-"""A first draft of the YAML for a robot's MJCF: the hand's body, the joints that drive the fingers, and a workspace."""
+"""A first draft of the YAML for a robot's MJCF: the hand's body, the joints that drive the
+fingers, and a workspace.
+"""
 
 import itertools
 import json
@@ -18,11 +20,14 @@ from manip_il.robots.spec import joint_range, load
 
 _ARM_GOES_ON = 3  # a branch with this many joints in series belongs to the arm: a finger has fewer
 _JAWS = ("jaw", "finger", "grip", "claw")  # words in the name of a single jaw's body or joint
-_HANDS = ("hand", "flange", "attachment", "tool", "gripper", "ee", "tcp")  # words in the name of a gripper's mount
-_REACHES, _HALF = 0.5, 0.18  # distance of the workspace's centre from the base, and its half width, in arm lengths
+# words in the name of a gripper's mount
+_HANDS = ("hand", "flange", "attachment", "tool", "gripper", "ee", "tcp")
+# distance of the workspace's centre from the base, and its half width, in arm lengths
+_REACHES, _HALF = 0.5, 0.18
 _WIDEST, _HIGHEST = 0.15, 0.45  # largest half width and height of a workspace [m]
 _YAML = """\
-# A first draft, derived from the model. Review it: manip-il view --robot.type=THIS_FILE (docs/robots.md)
+# A first draft, derived from the model (docs/robots.md). Review it:
+# manip-il view --robot.type=THIS_FILE
 model: {model}
 hand: {hand} # body that carries the gripper
 gripper:{own}
@@ -38,9 +43,12 @@ workspace:
 
 
 def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
-    """Inspect a robot's MJCF, and its gripper's if there is one; return the content of a YAML, without paths.
+    """Inspect a robot's MJCF, and its gripper's if there is one.
 
-    Raises `UsageError` if MuJoCo cannot read or compile them, or if no hand or no fingers are found.
+    Return the content of a YAML, without paths.
+
+    Raises `UsageError` if MuJoCo cannot read or compile them, or if no hand or no fingers are
+    found.
     """
     last = gripper or model
     spec, with_jaws = (load(ModelFiles(path.absolute()), model.stem) for path in (model, last))
@@ -49,7 +57,11 @@ def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
     driven = _driven(with_jaws, jaws, last)
     try:
         fingers = _ends(with_jaws, palm, jaws, driven)
-        return {"hand": hand.name, "gripper": fingers, "workspace": _workspace(spec.compile(), hand.name)}
+        return {
+            "hand": hand.name,
+            "gripper": fingers,
+            "workspace": _workspace(spec.compile(), hand.name),
+        }
     except ValueError as error:
         raise UsageError(f"MuJoCo cannot compile {last}: {one_line(error)}") from None
 
@@ -60,7 +72,10 @@ def _depth(body: Any) -> int:
 
 
 def _palm(spec: mujoco.MjSpec, path: Path) -> tuple[Any, list[Any]]:
-    """The body at which the chain of joints branches into fingers, and the first body of each; one jaw is enough."""
+    """The body at which the chain of joints branches into fingers, and the first body of each.
+
+    One jaw is enough.
+    """
     body = spec.worldbody
     while moving := [child for child in body.bodies if _depth(child)]:
         longest = max(moving, key=_depth)
@@ -70,21 +85,27 @@ def _palm(spec: mujoco.MjSpec, path: Path) -> tuple[Any, list[Any]]:
     if body.joints and any(word in f"{body.name} {body.joints[0].name}".lower() for word in _JAWS):
         return body.parent, [body]
     raise UsageError(
-        f"{path}: its joints do not branch into fingers, and its last body, {body.name!r}, is not named like a jaw;"
-        " if the gripper has a model of its own, give it with --gripper=PATH"
+        f"{path}: its joints do not branch into fingers, and its last body, {body.name!r}, is not"
+        " named like a jaw; if the gripper has a model of its own, give it with --gripper=PATH"
     )
 
 
 def _flange(body: Any) -> Any:
-    """The body that a gripper is mounted on: the last of the chain, or one fixed to it with a name in `_HANDS`."""
+    """The body that a gripper is mounted on: the last of the chain, or one fixed to it with a
+    name in `_HANDS`.
+    """
     while moving := [child for child in body.bodies if _depth(child)]:
         body = max(moving, key=_depth)
-    named = [part for part in body.find_all("body") if any(word in part.name.lower() for word in _HANDS)]
+    named = [
+        part for part in body.find_all("body") if any(word in part.name.lower() for word in _HANDS)
+    ]
     return named[-1] if named else body
 
 
 def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
-    """The finger joints to drive: those that slide, else those with motors, else those next to the hand."""
+    """The finger joints to drive: those that slide, else those with motors, else those next to
+    the hand.
+    """
     joints = [joint for jaw in jaws for joint in jaw.find_all("joint")]
     slides = [joint for joint in joints if joint.type == mujoco.mjtJoint.mjJNT_SLIDE]
     motors = {motor.target for motor in spec.actuators}
@@ -96,15 +117,24 @@ def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
     driven = slides or motored or in_step or next_to_hand
     if not driven or not all(joint.name and joint.range[0] < joint.range[1] for joint in driven):
         raise UsageError(
-            f"{path}: no joint with a name and a range moves the fingers; write the YAML by hand (docs/robots.md)"
+            f"{path}: no joint with a name and a range moves the fingers; write the YAML by hand"
+            " (docs/robots.md)"
         )
     return driven
 
 
-def _ends(spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[Any]) -> dict[str, Any]:
-    """Find each driven joint's closed and open positions, by the fingers' distance, and the bodies that touch."""
+def _ends(
+    spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[Any]
+) -> dict[str, Any]:
+    """Find each driven joint's closed and open positions, by the fingers' distance, and the
+    bodies that touch.
+    """
     names = {joint.name for joint in driven}
-    moving = [jaw.name for jaw in jaws if not names.isdisjoint(joint.name for joint in jaw.find_all("joint"))]
+    moving = [
+        jaw.name
+        for jaw in jaws
+        if not names.isdisjoint(joint.name for joint in jaw.find_all("joint"))
+    ]
     bodies = moving if len(moving) > 1 else [palm.name, *moving]
     ranges = [tuple(joint_range(joint).tolist()) for joint in driven]
     model = spec.compile()
@@ -124,18 +154,30 @@ def _ends(spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[
     closed, opened = list[float](), list[float]()
     for place, ends in enumerate(ranges):
         before, after = middle[:place], middle[place + 1 :]
-        near, far = sorted(ends, key=lambda end, before=before, after=after: gap([*before, end, *after]))
+        near, far = sorted(
+            ends, key=lambda end, before=before, after=after: gap([*before, end, *after])
+        )
         closed.append(near)
         opened.append(far)
     gap(closed)
     if len(moving) > 1:
-        bodies = [model.body(model.geom_bodyid[pad]).name for pad in nearest(model, data, fingers)[0]]
-    closed, opened = ([float(f"{end:.5g}") + 0.0 for end in ends] for ends in (closed, opened))  # no -0
-    return {"joints": [joint.name for joint in driven], "closed": closed, "open": opened, "fingers": bodies}
+        bodies = [
+            model.body(model.geom_bodyid[pad]).name for pad in nearest(model, data, fingers)[0]
+        ]
+    # no -0
+    closed, opened = ([float(f"{end:.5g}") + 0.0 for end in ends] for ends in (closed, opened))
+    return {
+        "joints": [joint.name for joint in driven],
+        "closed": closed,
+        "open": opened,
+        "fingers": bodies,
+    }
 
 
 def _workspace(model: mujoco.MjModel, hand: str) -> dict[str, Any]:
-    """Propose a workspace, given the arm's length from its second joint to the hand and where its base is."""
+    """Propose a workspace, given the arm's length from its second joint to the hand and where
+    its base is.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     body = model.body(hand).id
@@ -159,7 +201,10 @@ def _to_centimetres(length: float) -> float:
 
 
 def yaml_of(found: Mapping[str, Any], model: str, gripper: str = "") -> str:
-    """Return what `suggest` found as YAML text, with comments. model, gripper: their paths, as written to the YAML."""
+    """Return what `suggest` found as YAML text, with comments. model, gripper: their paths, as
+    written to the YAML.
+    """
     values = {"model": model, "hand": found["hand"], **found["gripper"], **found["workspace"]}
-    words = {key: json.dumps(value, ensure_ascii=False) for key, value in values.items()}  # JSON is YAML
+    # JSON is YAML
+    words = {key: json.dumps(value, ensure_ascii=False) for key, value in values.items()}
     return _YAML.format(own=f"\n  model: {json.dumps(gripper)}" if gripper else "", **words)

@@ -23,7 +23,8 @@ GROUP = "manip_il.robots"  # entry points: a robot's name, and the path of its Y
 
 
 def get_robot(name: NameOrPath) -> Robot:
-    """Return a robot by its name or its entry point, or from the YAML at a `Path` that the user gave.
+    """Return a robot by its name or its entry point, or from the YAML at a `Path` that the user
+    gave.
 
     Raises `UnknownName`, `UsageError`.
     """
@@ -36,7 +37,9 @@ def get_robot(name: NameOrPath) -> Robot:
             path = Path(found.load())
         except Exception as error:
             why = checks.one_line(error)
-            raise UsageError(f"robot {name} of {found.value}: {why}; expected the path of a YAML") from error
+            raise UsageError(
+                f"robot {name} of {found.value}: {why}; expected the path of a YAML"
+            ) from error
         return _read(path.absolute())
     raise UnknownName("robot", name, (*ROBOTS, "the path of a YAML"))
 
@@ -54,18 +57,23 @@ def read_robot(path: Path) -> Robot:
         said = _said(path, read_yaml(path, "a robot's YAML"))
         if all(name in said for name in FOUND):
             return Robot(**said)
-        from manip_il.robots.found import complete  # imported here: mink is slow, and a shipped YAML is complete
+        # imported here: mink is slow, and a shipped YAML is complete
+        from manip_il.robots.found import complete
 
         return complete(said)
     except ValueError as error:  # MuJoCo's, for a model that it reads but cannot compile
-        raise UsageError(f"{path}: MuJoCo cannot compile its model: {checks.one_line(error)}") from None
+        raise UsageError(
+            f"{path}: MuJoCo cannot compile its model: {checks.one_line(error)}"
+        ) from None
     except ManipError as error:
         named = str(path) in str(error) or f"robot {path.stem}" in str(error)
         raise UsageError(str(error) if named else f"{path}: {error}") from None
 
 
 def _said(path: Path, tree: Any) -> dict[str, Any]:
-    """The fields that a YAML gives, the arm's joints, and the defaults that depend on their number."""
+    """The fields that a YAML gives, the arm's joints, and the defaults that depend on their
+    number.
+    """
     tree, kinds = dict(checks.mapping(str(path), tree)), typing.get_type_hints(Robot)
     known = (*KEYS, *(name for name in kinds if name not in ("name", "files")))
     for key in tree:
@@ -85,12 +93,17 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
     for camera in checks.mapping("cameras", tree.get("cameras", {})):
         if camera not in SCENE_CAMERAS:
             raise UnknownName("camera in a robot's YAML:", camera, SCENE_CAMERAS)
-    said |= {key: read(key, kinds[key], value) for key, value in tree.items() if key not in (*KEYS, "gripper")}
+    said |= {
+        key: read(key, kinds[key], value)
+        for key, value in tree.items()
+        if key not in (*KEYS, "gripper")
+    }
     if "joints" not in said:
         said["joints"] = arm_joints(said["name"], said["files"], said["hand"], said["gripper"])
     upright = len(said["joints"]) >= _UPRIGHT_JOINTS
     said.setdefault("yaw", YAWS[not upright])
-    if not upright and "orientation" in costs:  # such an arm leans, however much its orientation costs
+    # such an arm leans, however much its orientation costs
+    if not upright and "orientation" in costs:
         costs = {"leaning": costs["orientation"]} | costs
     said["costs"] = read("costs", Costs, vars(UPRIGHT if upright else SOFT) | costs)
     return said
@@ -102,7 +115,10 @@ def _gripper(tree: Mapping[str, Any], folder: Path) -> GripperConfig:
     gripper: GripperConfig = read("gripper", GripperConfig, own)
     if "model" not in tree:
         return gripper
-    names = {key: tuple(GRIPPER + name for name in getattr(gripper, key)) for key in ("joints", "fingers")}
+    names = {
+        key: tuple(GRIPPER + name for name in getattr(gripper, key))
+        for key in ("joints", "fingers")
+    }
     return replace(gripper, files=ModelFiles.read("gripper.", tree, folder), **names)
 
 

@@ -1,7 +1,9 @@
-"""A chain of Feetech STS3215 servos behind a pseudo-terminal: their serial protocol, from LeRobot's own tables.
+"""A chain of Feetech STS3215 servos behind a pseudo-terminal: their serial protocol, from LeRobot's
+own tables.
 
-A packet is `FF FF id length instruction parameters checksum`; an answer has an error byte in place of the instruction.
-The checksum is the complement of the sum of all bytes from the id on. Present_Position = encoder - Homing_Offset.
+A packet is `FF FF id length instruction parameters checksum`; an answer has an error byte in place
+of the instruction. The checksum is the complement of the sum of all bytes from the id on.
+Present_Position = encoder - Homing_Offset.
 """
 
 import contextlib
@@ -54,11 +56,11 @@ Calibration = dict[str, dict[str, int]]
 class Bus:
     """Servos on a pseudo-terminal; a thread of their own answers packets.
 
-    calibration: the registers that the servos keep without power, by joint name. bus[NAME]: values of one
-    register of all servos, (n,), by LeRobot's NAME. path: device file, for any program that uses serial ports. lock:
-    held while a packet is answered; hold it to read several registers at the same moment. commands: number of sync
-    writes received. on_read: called when one packet reads the positions of several servos, which a client does once per
-    control step.
+    calibration: the registers that the servos keep without power, by joint name. bus[NAME]: values
+    of one register of all servos, (n,), by LeRobot's NAME. path: device file, for any program that
+    uses serial ports. lock: held while a packet is answered; hold it to read several registers at
+    the same moment. commands: number of sync writes received. on_read: called when one packet reads
+    the positions of several servos, which a client does once per control step.
     """
 
     def __init__(self, calibration: Calibration):
@@ -72,7 +74,8 @@ class Bus:
         self.commands = 0
         self.on_read: Callable[[], None] = lambda: None
         self._waiting = b""
-        self._master, self._slave = pty.openpty()  # keeping the other end open keeps the port alive between clients
+        # keeping the other end open keeps the port alive between clients
+        self._master, self._slave = pty.openpty()
         os.set_blocking(self._master, False)
         tty.setraw(self._master)
         tty.setraw(self._slave)
@@ -95,9 +98,16 @@ class Bus:
 
     @property
     def calibration(self) -> Calibration:
-        """The registers that the servos keep without power, in the format of LeRobot's calibration file."""
-        kept = {"drive_mode": np.zeros(len(self._names), int)} | {key: self[name] for key, name in _KEPT.items()}
-        return {name: {key: int(kept[key][joint]) for key in kept} for joint, name in enumerate(self._names)}
+        """The registers that the servos keep without power, in the format of LeRobot's
+        calibration file.
+        """
+        kept = {"drive_mode": np.zeros(len(self._names), int)} | {
+            key: self[name] for key, name in _KEPT.items()
+        }
+        return {
+            name: {key: int(kept[key][joint]) for key in kept}
+            for joint, name in enumerate(self._names)
+        }
 
     def goals(self) -> F64:
         """Return the servos' last goals, clipped to their limits [rad], (n,)."""
@@ -108,8 +118,11 @@ class Bus:
             encoder = np.where(low < high, np.clip(goal, low, high), goal) + self["Homing_Offset"]
         return np.asarray((encoder - _CENTRE) * STEP, float)
 
-    def show(self, q: F64, velocity: ArrayLike = 0.0, load: ArrayLike = 0.0, *, settled: bool = False) -> None:
-        """Set what the servos measure, (n,): angle [rad], velocity [rad/s], load as a share of stall torque, -1 to 1.
+    def show(
+        self, q: F64, velocity: ArrayLike = 0.0, load: ArrayLike = 0.0, *, settled: bool = False
+    ) -> None:
+        """Set what the servos measure, (n,): angle [rad], velocity [rad/s], load as a share of
+        stall torque, -1 to 1.
 
         settled: also set their goals to these angles.
         """
@@ -130,13 +143,17 @@ class Bus:
     def _run(self) -> None:
         while not self._closing.is_set():
             if select.select([self._master], [], [], 0.1)[0]:
-                with contextlib.suppress(BlockingIOError):  # a client that reads no answers loses them
+                # a client that reads no answers loses them
+                with contextlib.suppress(BlockingIOError):
                     os.write(self._master, self.feed(os.read(self._master, 4096)))
 
     def feed(self, received: bytes) -> bytes:
-        """Return the answers to all packets that these bytes complete; keep the rest for the next call.
+        """Return the answers to all packets that these bytes complete.
 
-        Invalid data, including packets with a wrong checksum, is skipped byte by byte, as a packet may begin anywhere.
+        Keep the rest for the next call.
+
+        Invalid data, including packets with a wrong checksum, is skipped byte by byte, as a packet
+        may begin anywhere.
         """
         answers = b""
         self._waiting += received
@@ -158,15 +175,22 @@ class Bus:
         return answers
 
     def _answer(self, body: list[int]) -> bytes:
-        """Return the answer to a packet, from its id on without the checksum; b"" if none is due."""
+        """Return the answer to a packet, from its id on without the checksum.
+
+        B"" if none is due.
+        """
         here = {int(servo[_ID]): servo for servo in self.memory}
         match body:
             case [number, _, protocol.INST_PING]:
-                return b"".join(_packet(one) for one in here if number in (one, protocol.BROADCAST_ID))
+                return b"".join(
+                    _packet(one) for one in here if number in (one, protocol.BROADCAST_ID)
+                )
             case [_, _, protocol.INST_SYNC_READ, address, size, *asked]:
                 if address <= _POSITION < address + size and len(asked) > 1:
                     self.on_read()
-                return b"".join(_packet(one, _part(here[one], address, size)) for one in asked if one in here)
+                return b"".join(
+                    _packet(one, _part(here[one], address, size)) for one in asked if one in here
+                )
             case [_, _, protocol.INST_SYNC_WRITE, address, size, *rest]:
                 self.commands += 1
                 for place in range(0, len(rest) - size, size + 1):

@@ -24,8 +24,8 @@ _QUALITY = 90  # JPEG quality
 class Cameras:
     """A thread that streams a station's cameras on one port, `RATE` times per second.
 
-    images: camera -> its last picture, RGB (height, width, 3). Raises `UsageError` for a port that is taken,
-    `RenderError` if there is no off-screen OpenGL.
+    images: camera -> its last picture, RGB (height, width, 3). Raises `UsageError` for a port that
+    is taken, `RenderError` if there is no off-screen OpenGL.
     """
 
     def __init__(self, station: Station, cameras: CameraConfig, port: int):
@@ -38,15 +38,21 @@ class Cameras:
         try:
             self._socket.bind(f"tcp://127.0.0.1:{port}")
         except zmq.ZMQError as error:
-            raise UsageError(f"--camera_port={port} cannot be used ({error}); give another one") from error
+            raise UsageError(
+                f"--camera_port={port} cannot be used ({error}); give another one"
+            ) from error
         self._stop = threading.Event()
-        render.close()  # an OpenGL context belongs to the thread that made it; the new thread makes its own
+        # an OpenGL context belongs to the thread that made it; the new thread makes its own
+        render.close()
         self._thread = ThreadPoolExecutor(1)
         self._thread.submit(self._send).result()
         self._running = self._thread.submit(self._run)
 
     def close(self) -> None:
-        """Stop the thread and free the port. Raises the error that has ended the stream, if one has."""
+        """Stop the thread and free the port.
+
+        Raises the error that has ended the stream, if one has.
+        """
         self._stop.set()
         self._thread.submit(render.close)
         self._thread.shutdown()
@@ -63,6 +69,9 @@ class Cameras:
         env = self._station.env
         self._data.qpos[:], self._data.mocap_pos[:], self._data.mocap_quat[:] = self._station.seen
         self.images = render.pictures(env.scene, self._data, self.config, env.world.variation)
-        # RGB is encoded without swapping and the client's `imdecode` does not swap either, so red stays red.
+        # RGB is encoded without swapping and the client's `imdecode` does not swap either, so red
+        # stays red.
         texts = {name: encode_image(image, _QUALITY) for name, image in self.images.items()}
-        self._socket.send_string(json.dumps({"timestamps": dict.fromkeys(texts, time.time()), "images": texts}))
+        self._socket.send_string(
+            json.dumps({"timestamps": dict.fromkeys(texts, time.time()), "images": texts})
+        )

@@ -1,6 +1,8 @@
-"""Successive worlds of a session, and a log of what the client does not see: states, labels, and who drove.
+"""Successive worlds of a session, and a log of what the client does not see: states, labels, and
+who drove.
 
-A frame is logged when the client reads the follower's position, so that the frames match those of its own dataset.
+A frame is logged when the client reads the follower's position, so that the frames match those of
+its own dataset.
 """
 
 from dataclasses import replace
@@ -22,30 +24,43 @@ from manip_il.worlds.table import env_fingerprint, env_spec
 
 
 class ServedEpisodes:
-    """Episodes of a station; those to keep are written as journals to a folder, for `manip-il data build`.
+    """Episodes of a station.
 
-    folder: None to write no journals. seed: seed of the stream of worlds, `--seed`; worlds with a journal in the folder
-    are not drawn again. leader: the function that moves the leader. driver: who moves the follower now.
+    Those to keep are written as journals to a folder, for `manip-il data build`.
+
+    folder: None to write no journals. seed: seed of the stream of worlds, `--seed`; worlds with a
+    journal in the folder are not drawn again. leader: the function that moves the leader. driver:
+    who moves the follower now.
     """
 
-    def __init__(self, station: Station, config: EnvConfig, folder: Path | None, seed: int, leader: Mover):
+    def __init__(
+        self, station: Station, config: EnvConfig, folder: Path | None, seed: int, leader: Mover
+    ):
         self._station = station
         self._env = env_of(config)
         self._leader = leader
         self._expert = LadderExpert(self._env.scene)
         self.driver = Actor.EXPERT
         self._reads: list[tuple[Read, Actor]] | None = None
-        self._journal = Journal(folder, env_spec(config), env_fingerprint(config)) if folder is not None else None
+        self._journal = (
+            Journal(folder, env_spec(config), env_fingerprint(config))
+            if folder is not None
+            else None
+        )
         there: list[int] = []
         if folder is not None and self._journal is not None:
             require_ours(folder, EPISODES)
             self._journal.prepare()
             recording = Recording.read(folder)
             if recording.provenance.get("driver", SERVED) != SERVED:
-                raise UsageError(f"--log={folder} holds journals of manip-il record; choose another folder")
+                raise UsageError(
+                    f"--log={folder} holds journals of manip-il record; choose another folder"
+                )
             Recording(provenance={"driver": SERVED}).write(folder)
             there = list_seeds(folder)
-        self._seeds = (number for number in stream_seeds("demonstrations", BLOCK, seed) if number not in there)
+        self._seeds = (
+            number for number in stream_seeds("demonstrations", BLOCK, seed) if number not in there
+        )
         self.renew()
 
     def renew(self, *, keep: bool = True) -> None:
@@ -60,7 +75,9 @@ class ServedEpisodes:
         self.drive(driver)
 
     def drive(self, driver: Actor) -> None:
-        """Set who moves the follower from now on: the leader if `driver` is the expert, else the program's policy."""
+        """Set who moves the follower from now on: the leader if `driver` is the expert, else the
+        program's policy.
+        """
         leads = driver is Actor.EXPERT
         self._station.mover = self._leader if leads else lambda: None
         self.driver = driver if not leads or self._leader == self._station.expert else Actor.LEARNER
@@ -90,7 +107,10 @@ class ServedEpisodes:
         env.set_state(now.state)
         label = self._expert.label(now.state)
         if label.valid:  # as the leader would show it: beyond the label by the follower's sag
-            label = replace(label, action=self._station.to_action(self._station.to_joints(label.action) + now.sag))
+            label = replace(
+                label,
+                action=self._station.to_action(self._station.to_joints(label.action) + now.sag),
+            )
         return Transition(
             seed=self._station.seed,
             step=step,

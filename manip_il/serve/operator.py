@@ -1,4 +1,6 @@
-"""Run a LeRobot program on a station, and do what a person would: press its keys and move the arms."""
+"""Run a LeRobot program on a station, and do what a person would: press its keys and move the
+arms.
+"""
 
 import contextlib
 import os
@@ -24,7 +26,8 @@ ENTER = b"\n"
 PAUSE = b" "
 CORRECT = b"\t"
 INTERRUPT = b"\x03"
-_SETTLED = 0.5  # time for a new world, or a joint at the end of its range, to settle before a key is pressed [s]
+# time for a new world, or a joint at the end of its range, to settle before a key is pressed [s]
+_SETTLED = 0.5
 _TERMINAL = 0.001  # time for printed text to arrive [s]
 _PATIENCE = 2  # number of horizons after which an episode counts as failed
 _DIFFERS = 0.25  # how long a policy must differ from the expert before it is corrected [s]
@@ -37,11 +40,14 @@ _HIDDEN = ("DISPLAY", "WAYLAND_DISPLAY")  # without them LeRobot reads its keys 
 class Operator:
     """A program in a terminal of its own, and its simulated operator.
 
-    intervene: how far a policy's targets may differ from the expert's before it is corrected, with LeRobot's DAgger
-    strategy [rad]. failed, solved: episodes so far. status: the program's exit code, once it has ended.
+    intervene: how far a policy's targets may differ from the expert's before it is corrected, with
+    LeRobot's DAgger strategy [rad]. failed, solved: episodes so far. status: the program's exit
+    code, once it has ended.
     """
 
-    def __init__(self, command: Sequence[str], station: Station, episodes: ServedEpisodes, intervene: float):
+    def __init__(
+        self, command: Sequence[str], station: Station, episodes: ServedEpisodes, intervene: float
+    ):
         self._station = station
         self._episodes = episodes
         self._intervene = intervene
@@ -56,12 +62,18 @@ class Operator:
             (r"Recording episode", self._record),
             (r"Reset the environment", self._renew),
             (r"Stop recording", self._finish),
-            (r"corrections-only recording started|DAgger continuous recording started", self._supervise),
+            (
+                r"corrections-only recording started|DAgger continuous recording started",
+                self._supervise,
+            ),
             (r"Phase transition: autonomous -> paused", partial(self._reply, CORRECT)),
             (r"Phase transition: paused -> correcting", self._correct),
             (r"Phase transition: correcting -> paused", self._resume),
             (r"Phase transition: paused -> autonomous", self._supervise),
-            (r"(?s)Mismatch between calibration.*Press ENTER to use provided", partial(self._reply, ENTER)),
+            (
+                r"(?s)Mismatch between calibration.*Press ENTER to use provided",
+                partial(self._reply, ENTER),
+            ),
             (r"Press ENTER to use provided calibration file", partial(self._reply, b"c" + ENTER)),
             (r"Move .* to the middle of its range of motion", self._centre),
             (r"sequentially through their entire ranges|Move all joints except", self._sweep),
@@ -71,7 +83,10 @@ class Operator:
         station.on_read = self._was_read
 
     def each_step(self) -> bool:
-        """Read the program's output and react; return False once it has ended, with its exit code in `status`."""
+        """Read the program's output and react.
+
+        Return False once it has ended, with its exit code in `status`.
+        """
         self._listen(0.0)
         while self._happened:
             event = self._happened.popleft()
@@ -109,7 +124,11 @@ class Operator:
         """Forward printed text to standard output, which may block, and react to it."""
         os.write(sys.stdout.fileno(), text.encode())
         self._heard += text
-        while found := [(match, act) for pattern, act in self._says if (match := re.search(pattern, self._heard))]:
+        while found := [
+            (match, act)
+            for pattern, act in self._says
+            if (match := re.search(pattern, self._heard))
+        ]:
             match, act = min(found, key=lambda pair: pair[0].start())
             self._heard = self._heard[match.end() :]
             self._doing = act()
@@ -117,7 +136,10 @@ class Operator:
         self._heard = self._heard[-_REMEMBERED:]
 
     def press(self, key: bytes) -> None:
-        """Press a key in the program's terminal; on Ctrl-C LeRobot's programs save what is complete and exit."""
+        """Press a key in the program's terminal.
+
+        On Ctrl-C LeRobot's programs save what is complete and exit.
+        """
         os.write(self._terminal, key)
 
     def _settle(self) -> Iterator[None]:
@@ -130,7 +152,8 @@ class Operator:
     def _attempt(self, *, supervised: bool = False) -> Iterator[None]:
         """Wait until the task is solved or time is up, and count the episode.
 
-        supervised: also end it when a policy deviates from the expert; only a solved episode counts then.
+        supervised: also end it when a policy deviates from the expert; only a solved episode counts
+        then.
         """
         astray, config = 0, self._station.env.config
         for _ in range(_PATIENCE * config.horizon):
@@ -145,7 +168,9 @@ class Operator:
         self.failed += not (supervised or self._station.is_solved)
 
     def _watch(self) -> Iterator[None]:
-        """For programs without episodes: once the follower moves, run attempts in a row, each in a new world."""
+        """For programs without episodes: once the follower moves, run attempts in a row, each in
+        a new world.
+        """
         while self._station.buses["follower"].commands < _TELEOPERATED:
             yield
         while True:
@@ -159,7 +184,10 @@ class Operator:
         yield from self._watch()
 
     def _record(self) -> Iterator[None]:
-        """Demonstrate; record a failed demonstration again, but keep a policy's attempt as it is."""
+        """Demonstrate.
+
+        Record a failed demonstration again, but keep a policy's attempt as it is.
+        """
         self._keep = False  # an attempt that Ctrl-C cuts off is not in the program's dataset either
         self._episodes.begin(self._driver)
         yield from self._attempt()
@@ -175,7 +203,10 @@ class Operator:
         yield
 
     def _supervise(self) -> Iterator[None]:
-        """Watch a policy in new worlds until it deviates from the expert or fails; then pause it."""
+        """Watch a policy in new worlds until it deviates from the expert or fails.
+
+        Then pause it.
+        """
         is_solved = True
         while is_solved:
             self._episodes.renew()
@@ -225,14 +256,16 @@ def _start(command: Sequence[str]) -> tuple[int, int]:
 
 
 def weigh_session(weight: str = "-20") -> str:
-    """Give this process's session the nice value `weight` and return the former one, or "" if this is not permitted.
+    """Give this process's session the nice value `weight` and return the former one, or "" if this
+    is not permitted.
 
-    Linux first shares CPU time among sessions (autogroups). The program and its servos run in two sessions, and each
-    must answer the other within milliseconds. Real-time priority would block the kernel's own threads, which carry
-    bytes from one end of a terminal to the other.
+    Linux first shares CPU time among sessions (autogroups). The program and its servos run in two
+    sessions, and each must answer the other within milliseconds. Real-time priority would block the
+    kernel's own threads, which carry bytes from one end of a terminal to the other.
     """
     with contextlib.suppress(OSError):
-        before = _AUTOGROUP.read_text().split()  # "/autogroup-12 nice 0"; empty if autogroups are off
+        # "/autogroup-12 nice 0"; empty if autogroups are off
+        before = _AUTOGROUP.read_text().split()
         if before:
             _AUTOGROUP.write_text(weight)
             return before[-1]

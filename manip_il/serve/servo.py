@@ -1,4 +1,6 @@
-"""How an STS3215 moves a joint: a position loop with gain, torque and speed limits, gear play and delay."""
+"""How an STS3215 moves a joint: a position loop with gain, torque and speed limits, gear play
+and delay.
+"""
 
 import math
 from collections import deque
@@ -17,8 +19,8 @@ _HAND = 100.0  # stiffness of a hand that holds an arm whose torque is off [N m/
 class Follower:
     """The servos of a bus as the motors of a simulated arm, in joint order, the gripper last.
 
-    Gravity acts on the arm. A servo whose torque is off keeps its position, as if a hand held it. q: the joints'
-    addresses in `qpos`, (n,). step: time between calls of `command` [s].
+    Gravity acts on the arm. A servo whose torque is off keeps its position, as if a hand held it.
+    q: the joints' addresses in `qpos`, (n,). step: time between calls of `command` [s].
     """
 
     def __init__(self, world: World, bus: Bus, step: float):
@@ -28,7 +30,9 @@ class Follower:
         self._step = step
         self.q = np.array([*scene.arm_q, *scene.gripper.q])
         self._ctrl = np.array([*scene.arm_ctrl, *scene.gripper.ctrl])
-        self._dof = model.jnt_dofadr[[int(np.flatnonzero(model.jnt_qposadr == q)[0]) for q in self.q]]
+        self._dof = model.jnt_dofadr[
+            [int(np.flatnonzero(model.jnt_qposadr == q)[0]) for q in self.q]
+        ]
         self._at = np.zeros(len(self.q))
         self._on = np.zeros(len(self.q), bool)
         self._coming = deque[F64]()
@@ -58,7 +62,9 @@ class Follower:
         return self._world.data.qfrc_bias[self._dof] / self._gain()
 
     def goal(self) -> F64:
-        """Return the servos' last goals as joint angles, without the encoders' offset [rad], (n,)."""
+        """Return the servos' last goals as joint angles, without the encoders' offset [rad],
+        (n,).
+        """
         return self._bus.goals() - self.offset
 
     def command(self) -> None:
@@ -77,7 +83,8 @@ class Follower:
         goal = self._coming.popleft()
         play = math.radians(self.config.play) / 2
         led = np.clip(self._at, goal - play, goal + play)
-        self._at = np.where(on, led, np.where(self._on, q, self._at))  # torque off: stay where it was turned off
+        # torque off: stay where it was turned off
+        self._at = np.where(on, led, np.where(self._on, q, self._at))
         self._on = on
         data.ctrl[self._ctrl] = np.where(on & (np.abs(self._at - q) < dead), q, self._at)
         gain = np.where(on, gain, _HAND)

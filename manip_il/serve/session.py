@@ -1,4 +1,6 @@
-"""A session of the virtual arm: open the ports, cameras, leader and program of `manip-il serve`, and close them."""
+"""A session of the virtual arm: open the ports, cameras, leader and program of `manip-il serve`,
+and close them.
+"""
 
 import contextlib
 import copy
@@ -30,7 +32,8 @@ from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import env_spec
 
 Say = Callable[[str], None]
-_UNPACED = 1e6  # a window's frame rate, so high that it never waits: the station keeps real time [Hz]
+# a window's frame rate, so high that it never waits: the station keeps real time [Hz]
+_UNPACED = 1e6
 
 
 def serve(
@@ -46,11 +49,11 @@ def serve(
 ) -> None:
     """Serve a virtual arm until the program of `command` ends, or until Ctrl-C if there is none.
 
-    cameras: the cameras to serve, if any. conditions: how worlds vary. policy: folder of the policy that moves the
-    leader, if any; it must fit environment and cameras. trust: whether the policy's models and code may be loaded.
-    say: called with lines for the user. Raises `UsageError` for a robot without Feetech servos or a port that is taken,
-    `MismatchError` for a policy that does not fit, `RenderError` for a window without a display, `ManipError` if the
-    program failed.
+    cameras: the cameras to serve, if any. conditions: how worlds vary. policy: folder of the policy
+    that moves the leader, if any; it must fit environment and cameras. trust: whether the policy's
+    models and code may be loaded. say: called with lines for the user. Raises `UsageError` for a
+    robot without Feetech servos or a port that is taken, `MismatchError` for a policy that does not
+    fit, `RenderError` for a window without a display, `ManipError` if the program failed.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.setswitchinterval(5e-4)  # [s]: short enough for the threads of the buses to answer in time
@@ -72,7 +75,8 @@ def serve(
             leader = station.expert if config.leader == "expert" else lambda: None
         episodes = ServedEpisodes(station, env, config.log, config.seed, leader)
         gc.collect()
-        gc.freeze()  # a full collection of what LeRobot and torch have imported takes longer than a client waits
+        # a full collection of what LeRobot and torch have imported takes longer than a client waits
+        gc.freeze()
         stack.callback(gc.unfreeze)
         for line in described(station, config, cameras):
             say(line)
@@ -85,19 +89,24 @@ def serve(
 
 
 def described(station: Station, config: SessionConfig, cameras: CameraConfig | None) -> list[str]:
-    """Return lines for the user: the ports, their calibration files, and a `lerobot-record` command to copy."""
+    """Return lines for the user: the ports, their calibration files, and a `lerobot-record`
+    command to copy.
+    """
     root, port = config.output_dir, config.camera_port
     size = f"width: {cameras.width}, height: {cameras.height}, fps: {RATE}" if cameras else ""
     shown = ", ".join(
-        f"{name}: {{type: zmq, server_address: 127.0.0.1, port: {port}, camera_name: {name}, {size}}}"
+        f"{name}: {{type: zmq, server_address: 127.0.0.1, port: {port}, camera_name: {name},"
+        f" {size}}}"
         for name in (cameras.names if cameras else ())
     )
     seen = f' --robot.cameras="{{{shown}}}"' if shown else ""
     return [
         *(f"{name}: {root / name} (its calibration: {root / name}.json)" for name in station.buses),
         "to record what the leader demonstrates, as with a real arm:",
-        f"lerobot-record --robot.type=so101_follower --robot.port={root}/follower --robot.id=follower "
-        f"--robot.calibration_dir={root}{seen} --teleop.type=so101_leader --teleop.port={root}/leader "
+        f"lerobot-record --robot.type=so101_follower --robot.port={root}/follower"
+        " --robot.id=follower "
+        f"--robot.calibration_dir={root}{seen} --teleop.type=so101_leader"
+        f" --teleop.port={root}/leader "
         f"--teleop.id=leader --teleop.calibration_dir={root} --dataset.repo_id=local/so101 "
         f'--dataset.single_task="{station.env.task_description}" --dataset.push_to_hub=false '
         f"--dataset.fps={station.env.config.control_hz}",
@@ -105,7 +114,10 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
 
 
 def policy_mover(policy: LearnedPolicy, station: Station, cameras: Cameras | None) -> Mover:
-    """Return a function that moves the leader as a policy commands. The policy sees the cameras' latest pictures."""
+    """Return a function that moves the leader as a policy commands.
+
+    The policy sees the cameras' latest pictures.
+    """
     seed = None
 
     def move() -> F64:
@@ -120,13 +132,18 @@ def policy_mover(policy: LearnedPolicy, station: Station, cameras: Cameras | Non
 
 
 def slider_mover(station: Station) -> Mover:
-    """Open a window with sliders that move the leader; return the mover. Raises `RenderError` without a display."""
+    """Open a window with sliders that move the leader; return the mover.
+
+    Raises `RenderError` without a display.
+    """
     env, window = station.env, Window(station.env.scene, _UNPACED, sliders=True)
     order, seed = np.array([*env.scene.arm_ctrl, *env.scene.gripper.ctrl]), None
 
     def move() -> F64:
         nonlocal seed
-        joints = window.commands[order] if seed == station.seed else env.data.qpos[station.follower.q]
+        joints = (
+            window.commands[order] if seed == station.seed else env.data.qpos[station.follower.q]
+        )
         seed, shown = station.seed, copy.copy(env.data)
         shown.ctrl[order] = joints
         window.show(shown, env.world.variation)
@@ -148,14 +165,22 @@ def _operate(operator: Operator, station: Station, program: str, say: Say) -> No
 
 
 def _stand(station: Station, episodes: ServedEpisodes, renews: bool, say: Say) -> None:
-    """Serve clients until Ctrl-C; draw a new world on Enter and, if `renews`, once the task is solved."""
+    """Serve clients until Ctrl-C.
+
+    Draw a new world on Enter and, if `renews`, once the task is solved.
+    """
     station.on_read = episodes.frame
     episodes.begin(Actor.EXPERT)
 
     def each_step() -> bool:
-        pressed = sys.stdin.isatty() and select.select([sys.stdin], [], [], 0)[0] and sys.stdin.readline()
+        pressed = (
+            sys.stdin.isatty() and select.select([sys.stdin], [], [], 0)[0] and sys.stdin.readline()
+        )
         if pressed or (renews and station.is_solved):
-            say(f"seed {station.seed}: {'solved' if station.is_solved else 'not solved'}; drawing a new world")
+            say(
+                f"seed {station.seed}: {'solved' if station.is_solved else 'not solved'}; drawing a"
+                " new world"
+            )
             episodes.renew()
             episodes.begin(Actor.EXPERT)
         return True

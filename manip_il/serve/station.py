@@ -1,4 +1,6 @@
-"""A simulated arm, its world and its leader, which advance with the wall clock, whether or not a client reads them."""
+"""A simulated arm, its world and its leader, which advance with the wall clock, whether or not a
+client reads them.
+"""
 
 import copy
 import json
@@ -34,8 +36,8 @@ Mover = Callable[[], F64 | None]
 class Read(NamedTuple):
     """The world and the follower when a client reads the follower's position.
 
-    told: the follower's target after `commands` commands. sag: how far the follower hangs below its target. Both are
-    joint angles [rad], (n,).
+    told: the follower's target after `commands` commands. sag: how far the follower hangs below its
+    target. Both are joint angles [rad], (n,).
     """
 
     state: State
@@ -47,28 +49,31 @@ class Read(NamedTuple):
 class Station:
     """Two ports, `follower` and `leader`, in a folder, and the simulation behind them.
 
-    `NAME.json` beside each port is its calibration in LeRobot's format: the registers that the servos keep without
-    power. on_read: called, from another thread, whenever a client reads the follower's position. mover: called every
-    control step; returns the joints to which the weightless leader moves [rad], (n,), or None if it stays. hand: joint
-    angles at which a hand holds both arms still [rad], (n,), or None. clock: paces the control steps. Raises
-    `UsageError` for a robot without Feetech servos.
+    `NAME.json` beside each port is its calibration in LeRobot's format: the registers that the
+    servos keep without power. on_read: called, from another thread, whenever a client reads the
+    follower's position. mover: called every control step; returns the joints to which the
+    weightless leader moves [rad], (n,), or None if it stays. hand: joint angles at which a hand
+    holds both arms still [rad], (n,), or None. clock: paces the control steps. Raises `UsageError`
+    for a robot without Feetech servos.
     """
 
     def __init__(self, env: ManipEnv, config: SessionConfig):
         robot = env.scene.robot
         if robot.lerobot is None or robot.lerobot.robot_type != FEETECH:
             raise UsageError(
-                f"--robot.type={robot.name} has no Feetech servos; expected so101, or the YAML of an arm with "
-                f"lerobot.robot_type: {FEETECH}"
+                f"--robot.type={robot.name} has no Feetech servos; expected so101, or the YAML of"
+                f" an arm with lerobot.robot_type: {FEETECH}"
             )
-        env.world = World(replace(env.scene, model=copy.copy(env.scene.model)))  # a copy, as its motors become servos
+        # a copy, as its motors become servos
+        env.world = World(replace(env.scene, model=copy.copy(env.scene.model)))
         self.env, self._config = env, config
         self._servos = replace(config.servos, **IDEAL) if config.servo == "ideal" else config.servos
         self._expert = LadderExpert(env.scene)
         self._step = 1 / env.config.control_hz  # [s]
         self.clock = Clock(env.config.control_hz * config.speed)
         ranges = env.scene.model.jnt_range[np.isin(env.scene.model.jnt_qposadr, env.scene.arm_q)]
-        self.limits: F64 = np.array([*ranges, sorted(robot.lerobot.gripper)])  # the servos' joint limits [rad], (n, 2)
+        # the servos' joint limits [rad], (n, 2)
+        self.limits: F64 = np.array([*ranges, sorted(robot.lerobot.gripper)])
         self.buses = {name: self._open(name) for name in ("follower", "leader")}
         self.follower = Follower(env.world, self.buses["follower"], self._step)
         self.mover: Mover = lambda: None
@@ -82,7 +87,9 @@ class Station:
         link = self._config.output_dir / name
         link.parent.mkdir(parents=True, exist_ok=True)
         kept: Calibration = {}
-        for number, (label, limits) in enumerate(zip(self.env.scene.robot.joint_names, self.limits, strict=True), 1):
+        for number, (label, limits) in enumerate(
+            zip(self.env.scene.robot.joint_names, self.limits, strict=True), 1
+        ):
             joint = label.removesuffix(".pos")
             low, high = (0, STEPS - 1) if joint == _FULL_TURN else encoder_steps(limits)
             kept[joint] = {"id": number, "homing_offset": 0, "range_min": low, "range_max": high}
@@ -99,7 +106,9 @@ class Station:
     def look(self) -> Read:
         """Return the world and the follower as a client reads them now."""
         with self.buses["follower"].lock:
-            return Read(self._shown, self.follower.goal(), self._sag, self.buses["follower"].commands)
+            return Read(
+                self._shown, self.follower.goal(), self._sag, self.buses["follower"].commands
+            )
 
     @property
     def is_solved(self) -> bool:
@@ -107,18 +116,26 @@ class Station:
         return self._solved >= HELD * self.env.config.control_hz
 
     def expert(self) -> F64 | None:
-        """Return the joints [rad], (n,), to which the expert moves the leader; None if the state has no valid label.
+        """Return the joints [rad], (n,), to which the expert moves the leader.
+
+        None if the state has no valid label.
 
         These are the label's joints plus the follower's sag and the offset of its servos.
         """
         label = self._expert.label(self.env.get_state(), self.env)
-        return self.to_joints(label.action) + self.follower.sag() + self.follower.offset if label.valid else None
+        return (
+            self.to_joints(label.action) + self.follower.sag() + self.follower.offset
+            if label.valid
+            else None
+        )
 
     def reset(self, seed: int) -> None:
         """Draw the world of a seed; follower and leader are at its start posture."""
         self.env.start(seed)
         self.seed, self._solved = seed, 0
-        self.follower.reset(self._servos.varied(rng_for(seed, "servos")) if self._config.varies else self._servos)
+        self.follower.reset(
+            self._servos.varied(rng_for(seed, "servos")) if self._config.varies else self._servos
+        )
         self._place_leader(self.env.data.qpos[self.follower.q])
         self._show()
 
@@ -150,7 +167,10 @@ class Station:
         self.buses["leader"].show(q, settled=True)
 
     def _move_leader(self, q: F64 | None) -> None:
-        """Move joints towards `q` at up to the servos' speed; those with torque on move to their goals instead."""
+        """Move joints towards `q` at up to the servos' speed.
+
+        Those with torque on move to their goals instead.
+        """
         bus, most = self.buses["leader"], self._servos.speed * self._step
         wanted = np.where(bus["Torque_Enable"] > 0, bus.goals(), self._leader if q is None else q)
         self._leader = self._leader + np.clip(wanted - self._leader, -most, most)
@@ -158,7 +178,8 @@ class Station:
 
     def _show(self) -> None:
         """Update what clients and cameras see."""
-        data, state = self.env.data, replace(self.env.get_state(), begun=True)  # shown without a knock that may follow
+        # shown without a knock that may follow
+        data, state = self.env.data, replace(self.env.get_state(), begun=True)
         self.seen = data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()
         with self.buses["follower"].lock:
             self.follower.show()

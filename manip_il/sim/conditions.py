@@ -1,7 +1,9 @@
-"""Conditions: named ranges of what may differ from the nominal world; an episode's seed alone decides its values.
+"""Conditions: named ranges of what may differ from the nominal world.
 
-The drawn values are applied to the model by `variation.py`, to pictures by `view.py`, to what a policy observes by
-`env.py`, and during the episode by `events.py`.
+An episode's seed alone decides its values.
+
+The drawn values are applied to the model by `variation.py`, to pictures by `view.py`, to what a
+policy observes by `env.py`, and during the episode by `events.py`.
 
 What an episode's condition can vary: one table of bounds, draws, and places in a state's variation.
 """
@@ -58,11 +60,12 @@ class Quantity(NamedTuple):
 
     Args:
         bounds: Limits of its range.
-        changes: `model` for the physics, `look` and `pictures` for what only cameras show, `sensing` for noise in
-            observations; empty for the rest.
+        changes: `model` for the physics, `look` and `pictures` for what only cameras show,
+            `sensing` for noise in observations; empty for the rest.
         of_object: Whether it has no effect in a task without an object.
         draw: How an episode's value is drawn from the range.
-        places: Where its numbers are in the world's part of a variation, camera after camera in the order of `CAMERAS`.
+        places: Where its numbers are in the world's part of a variation, camera after camera in the
+            order of `CAMERAS`.
         nominal: Each of these numbers if nothing is drawn.
     """
 
@@ -79,7 +82,8 @@ class Quantity(NamedTuple):
         return self.draw in (_whole, _whole_and_seed)
 
 
-# Place 0 of the world's part of a variation is the shape's. The camera at the side got its places after the others.
+# Place 0 of the world's part of a variation is the shape's. The camera at the side got its places
+# after the others.
 RANGES = {
     "action_noise": Quantity((0, 1)),
     "random_actions": Quantity((0, 1)),
@@ -110,22 +114,26 @@ _KNOCK_STEP = (5, 24)  # default for a condition with a knock
 
 @dataclass(frozen=True, init=False)
 class Condition:
-    """Ranges (low, high), both ends included, or single numbers, for the quantities below; all others are nominal.
+    """Ranges (low, high), both ends included, or single numbers, for the quantities below.
 
-    action_noise: standard deviation of Gaussian noise on every executed action, as a share of its full range.
-    random_actions: share of control steps at which a random action is executed, each joint within its longest step.
-    knock: distance by which the object is moved once [m], at a control step from knock_step, by default 5 to 24.
-    joint_noise [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position
-    in a policy's observations. delay: control steps by which observations are late. mass [kg], size (edge or width [m])
-    and sliding friction of the object. colour: red, green and blue of the object, each from the range; table: the same
-    for the table. joint_damping: factor on the damping of every arm joint; actuator_gain: factor on kp of the arm's
-    actuators, and its square root on kv. posture: largest offset of every joint from home at the start [rad].
-    camera_shift [m], camera_turn [deg]: shift and rotation of every camera, in a random direction. brightness: factor
-    on every lamp; light_turn: rotation of the lamps about the vertical [deg]. clutter: number of visual objects around
-    the workspace. picture_delay: control steps by which only pictures are late.
+    All others are nominal.
 
-    Raises `UnknownName` for an unknown range, `UsageError` for a range that is empty or out of bounds, `ManipError` for
-    a name that cannot be a file name.
+    action_noise: standard deviation of Gaussian noise on every executed action, as a share of its
+    full range. random_actions: share of control steps at which a random action is executed, each
+    joint within its longest step. knock: distance by which the object is moved once [m], at a
+    control step from knock_step, by default 5 to 24. joint_noise [rad], position_noise [m]:
+    standard deviations of Gaussian noise on the joints and the object's position in a policy's
+    observations. delay: control steps by which observations are late. mass [kg], size (edge or
+    width [m]) and sliding friction of the object. colour: red, green and blue of the object, each
+    from the range; table: the same for the table. joint_damping: factor on the damping of every arm
+    joint; actuator_gain: factor on kp of the arm's actuators, and its square root on kv. posture:
+    largest offset of every joint from home at the start [rad]. camera_shift [m], camera_turn [deg]:
+    shift and rotation of every camera, in a random direction. brightness: factor on every lamp;
+    light_turn: rotation of the lamps about the vertical [deg]. clutter: number of visual objects
+    around the workspace. picture_delay: control steps by which only pictures are late.
+
+    Raises `UnknownName` for an unknown range, `UsageError` for a range that is empty or out of
+    bounds, `ManipError` for a name that cannot be a file name.
     """
 
     name: str
@@ -136,15 +144,21 @@ class Condition:
         if "knock" in ranges:
             ranges = {"knock_step": _KNOCK_STEP} | ranges
         ranges = {one: _range(name, one, range_) for one, range_ in ranges.items()}
-        kept = {one: ranges[one] for one in RANGES if one in ranges and (one != "knock_step" or "knock" in ranges)}
+        kept = {
+            one: ranges[one]
+            for one in RANGES
+            if one in ranges and (one != "knock_step" or "knock" in ranges)
+        }
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
     def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
-        """Return the condition without the ranges that have no effect; None if it had some and none is left.
+        """Return the condition without the ranges that have no effect.
 
-        has_object: whether the task has an object. sees: whether the policy has cameras. sizes: object sizes that the
-        task can take [m]; None: only its own.
-        Raises `UsageError` if none of the condition's sizes is among them.
+        None if it had some and none is left.
+
+        has_object: whether the task has an object. sees: whether the policy has cameras. sizes:
+        object sizes that the task can take [m]; None: only its own. Raises `UsageError` if none of
+        the condition's sizes is among them.
         """
         kept = {
             name: range_
@@ -160,18 +174,25 @@ class Condition:
         return Condition(self.name, **kept)
 
     def only(self, changes: str) -> Condition:
-        """Return the condition with only the ranges that change one thing, see `Quantity.changes`."""
-        kept = {name: range_ for name, range_ in self.ranges.items() if RANGES[name].changes == changes}
+        """Return the condition with only the ranges that change one thing, see
+        `Quantity.changes`.
+        """
+        kept = {
+            name: range_ for name, range_ in self.ranges.items() if RANGES[name].changes == changes
+        }
         return Condition(self.name, **kept)
 
     def draw(self, seed: int) -> dict[str, Any]:
-        """Return the values drawn for the episode of a seed, by the names of the ranges and in their units.
+        """Return the values drawn for the episode of a seed, by the names of the ranges and in
+        their units.
 
-        Each value has a random stream of its own, so that adding a range leaves the other values unchanged.
-        camera_shift and camera_turn have one vector (3,) per camera, in the camera's own frame.
+        Each value has a random stream of its own, so that adding a range leaves the other values
+        unchanged. camera_shift and camera_turn have one vector (3,) per camera, in the camera's own
+        frame.
         """
         return {
-            name: RANGES[name].draw(rng_for(seed, f"condition {name}"), range_) for name, range_ in self.ranges.items()
+            name: RANGES[name].draw(rng_for(seed, f"condition {name}"), range_)
+            for name, range_ in self.ranges.items()
         }
 
     def to_json(self) -> dict[str, Any]:
@@ -184,18 +205,27 @@ class Condition:
 
 
 def merged(conditions: Sequence[Condition]) -> Condition:
-    """Return one condition with the ranges of all, named after all; later ranges override earlier ones."""
+    """Return one condition with the ranges of all, named after all.
+
+    Later ranges override earlier ones.
+    """
     ranges = {name: range_ for condition in conditions for name, range_ in condition.ranges.items()}
-    return Condition("_".join(condition.name for condition in conditions)[: checks.LONGEST_NAME], **ranges)
+    return Condition(
+        "_".join(condition.name for condition in conditions)[: checks.LONGEST_NAME], **ranges
+    )
 
 
 def turn_of(conditions: Sequence[Condition], seed: int) -> Condition:
-    """Return the condition of a seed's episode: conditions take turns; if there are none, it is nominal."""
+    """Return the condition of a seed's episode: conditions take turns.
+
+    If there are none, it is nominal.
+    """
     return conditions[seed % len(conditions)] if conditions else NOMINAL
 
 
 def draw(conditions: Sequence[Condition], seed: int, shape: NameOrPath = "") -> dict[str, Any]:
-    """Return the values drawn for the episode of a seed, by name, from the condition that `turn_of` returns.
+    """Return the values drawn for the episode of a seed, by name, from the condition that `turn_of`
+    returns.
 
     shape: as in `EnvConfig.object`; if it is `any`, one of `KINDS` is drawn, too.
     """
@@ -215,14 +245,21 @@ def _range(condition: str, name: str, given: Any) -> Range:
     """A range as a tuple, from what Python or YAML gives: a pair or a number."""
     if name not in RANGES:
         raise UnknownName(f"key in {condition}:", name[: checks.LONGEST_NAME], RANGES)
-    what, ends = f"{condition}: {name}", given if isinstance(given, list | tuple) else (given, given)
+    what, ends = (
+        f"{condition}: {name}",
+        given if isinstance(given, list | tuple) else (given, given),
+    )
     try:
         low, high = (checks.number(what, end) for end in ends)
     except (ManipError, ValueError):
-        raise UsageError(f"{what} is {checks.shorten(given)}; expected a number, or [low, high]") from None
+        raise UsageError(
+            f"{what} is {checks.shorten(given)}; expected a number, or [low, high]"
+        ) from None
     least, most = RANGES[name].bounds
     if not least <= low <= high <= most:
-        raise UsageError(f"{what} is [{low}, {high}]; expected low <= high, both from {least} to {most}")
+        raise UsageError(
+            f"{what} is [{low}, {high}]; expected low <= high, both from {least} to {most}"
+        )
     if RANGES[name].is_whole and (low % 1 or high % 1):
         raise UsageError(f"{what} is [{low}, {high}]; expected whole numbers")
     return given if isinstance(given, tuple) else (low, high)
@@ -233,7 +270,10 @@ def _overlap(name: str, asked: Range, sizes: Range) -> Range:
     low, high = max(asked[0], sizes[0]), min(asked[1], sizes[1])
     if low > high:
         takes = f"{sizes[0]:.3g} to {sizes[1]:.3g} m"
-        raise UsageError(f"{name}: size is {words(asked)} m, and the task takes objects of {takes}; choose other sizes")
+        raise UsageError(
+            f"{name}: size is {words(asked)} m, and the task takes objects of {takes}; choose other"
+            " sizes"
+        )
     return low, high
 
 

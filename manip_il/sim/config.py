@@ -15,16 +15,27 @@ class Episodes:
     """Timing, success criterion and length of episodes. 0 means the robot's or task's own value."""
 
     control_hz: int = option(
-        0, "control steps per second; 0: the robot's own (so101: 30, others: 20)", at_least=0, at_most=MOST_HZ
+        0,
+        "control steps per second; 0: the robot's own (so101: 30, others: 20)",
+        at_least=0,
+        at_most=MOST_HZ,
     )
     tolerance: float = option(
-        0.0, "distance to the goal that counts as success [m]; 0: the task's own", at_least=0, at_most=1
+        0.0,
+        "distance to the goal that counts as success [m]; 0: the task's own",
+        at_least=0,
+        at_most=1,
     )
     success_steps: int = option(
-        0, "consecutive control steps within the tolerance that count as success; 0: the task's own", at_least=0
+        0,
+        "consecutive control steps within the tolerance that count as success; 0: the task's own",
+        at_least=0,
     )
     horizon: int = option(
-        0, "length of an episode [control steps]; 0: the task's own", at_least=0, at_most=LONGEST_EPISODE
+        0,
+        "length of an episode [control steps]; 0: the task's own",
+        at_least=0,
+        at_most=LONGEST_EPISODE,
     )
 
     @property
@@ -34,7 +45,9 @@ class Episodes:
 
     @property
     def physics_step(self) -> float:
-        """Physics time step: `DT_SIM`, or a little less if that does not divide a control step [s]."""
+        """Physics time step: `DT_SIM`, or a little less if that does not divide a control step
+        [s].
+        """
         return 1 / (self.control_hz * self.physics_steps)
 
 
@@ -45,11 +58,12 @@ _BRIGHTNESS = (0.1, 2.0)
 
 @dataclass(frozen=True)
 class Look:
-    """Lighting of a scene: part of a dataset's fingerprint, and adjustable when pictures are rendered again.
+    """Lighting of a scene: part of a dataset's fingerprint, and adjustable when pictures are
+    rendered again.
 
-    shadows: draw the main lamp's shadows; a picture then takes two to six times as long. brightness: factor on every
-    lamp. light_turn: rotation of the lamps about the vertical through the world's origin, -180 to 180 [deg].
-    Raises `UsageError` for a value out of range.
+    shadows: draw the main lamp's shadows; a picture then takes two to six times as long.
+    brightness: factor on every lamp. light_turn: rotation of the lamps about the vertical through
+    the world's origin, -180 to 180 [deg]. Raises `UsageError` for a value out of range.
     """
 
     shadows: bool = option(False, "draw shadows; rendering then takes two to six times as long")
@@ -59,7 +73,9 @@ class Look:
     def __post_init__(self) -> None:
         low, high = _BRIGHTNESS
         if not low <= self.brightness <= high:
-            raise UsageError(f"brightness is {self.brightness}; expected a factor from {low} to {high}")
+            raise UsageError(
+                f"brightness is {self.brightness}; expected a factor from {low} to {high}"
+            )
         if not -180 <= self.light_turn <= 180:
             raise UsageError(f"light_turn is {self.light_turn}; expected -180 to 180 degrees")
 
@@ -69,7 +85,8 @@ FILM = Look(shadows=True)  # for people: shadows show how high things are
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """Cameras that take a picture at every step, and the height, width [pixels] and look of their pictures.
+    """Cameras that take a picture at every step, and the height, width [pixels] and look of their
+    pictures.
 
     Raises `UsageError` if no camera is named or one is named twice, or if a height
     or width is odd (which 4:2:0 video does not allow) or out of range.
@@ -82,7 +99,10 @@ class CameraConfig:
 
     def __post_init__(self) -> None:
         if not self.names or len(set(self.names)) < len(self.names):
-            raise UsageError(f"cameras are {', '.join(self.names) or 'none'}; expected at least one, each named once")
+            raise UsageError(
+                f"cameras are {', '.join(self.names) or 'none'}; expected at least one, each named"
+                " once"
+            )
         if any(side % 2 or not MIN_SIDE <= side <= MAX_SIDE for side in self.size):
             raise UsageError(
                 f"pictures have height {self.height} and width {self.width}; "

@@ -1,4 +1,6 @@
-"""One gymnasium environment for every robot and task, with exact save and restore, and with conditions."""
+"""One gymnasium environment for every robot and task, with exact save and restore, and with
+conditions.
+"""
 
 from collections import deque
 from collections.abc import Sequence
@@ -33,19 +35,23 @@ _JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
 class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     """Joint-position control of one arm on one task. `manip_il.make_env` makes it from names.
 
-    Action: joint position targets and gripper command in the units of `ActionSpace`, (n,), float32. Observation: a dict
-    of `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
-    Reward is 1 while the task is solved, else 0. An episode ends only at the horizon (truncated), so that
-    "solved once" and "solved at the end" can both be measured. conditions: how episodes differ from the nominal world;
-    they take turns by seed, and `drawn` has the current episode's values. `get_state` returns the true state, without
-    the noise and delay of observations. Everything after it depends on the state, the actions and the conditions alone,
-    except that observations from before it do not arrive late after `set_state`.
-    render_mode: `rgb_array`, or `human`, with which `reset` and `step` update MuJoCo's viewer in real time.
-    Raises `UnknownName` for an unknown camera or render_mode, `UsageError` if the scene cannot be built,
-    `RenderError` for `human` without a display.
+    Action: joint position targets and gripper command in the units of `ActionSpace`, (n,), float32.
+    Observation: a dict of `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels`
+    {camera: uint8 (H, W, 3)}. Reward is 1 while the task is solved, else 0. An episode ends only at
+    the horizon (truncated), so that "solved once" and "solved at the end" can both be measured.
+    conditions: how episodes differ from the nominal world; they take turns by seed, and `drawn` has
+    the current episode's values. `get_state` returns the true state, without the noise and delay of
+    observations. Everything after it depends on the state, the actions and the conditions alone,
+    except that observations from before it do not arrive late after `set_state`. render_mode:
+    `rgb_array`, or `human`, with which `reset` and `step` update MuJoCo's viewer in real time.
+    Raises `UnknownName` for an unknown camera or render_mode, `UsageError` if the scene cannot be
+    built, `RenderError` for `human` without a display.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 20,
+    }
 
     def __init__(
         self,
@@ -77,7 +83,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.task = task.name
         limits = np.vstack([self.scene.actions.low, self.scene.actions.high])
         turn = 2 * np.pi if robot.lerobot is None else 360.0
-        limits = np.where(np.isfinite(limits), limits, np.sign(limits) * turn)  # a turn each way for an unlimited joint
+        # a turn each way for an unlimited joint
+        limits = np.where(np.isfinite(limits), limits, np.sign(limits) * turn)
         self.action_space = gymnasium.spaces.Box(*limits.astype(np.float32), dtype=np.float32)
         self.observation_space = self._observation_space()
 
@@ -137,9 +144,13 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._begun = False
         self._events = Events(self.world, drawn, seed)
         self._delay = drawn.get("delay", 0)
-        self._seen: deque[Observation] = deque(maxlen=self._delay + drawn.get("picture_delay", 0) + 1)
+        self._seen: deque[Observation] = deque(
+            maxlen=self._delay + drawn.get("picture_delay", 0) + 1
+        )
 
-    def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: NDArray[Any]
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Apply one action (n,) for one control step."""
         self.advance(action)
         if self.render_mode == "human":
@@ -157,7 +168,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._begun = True
 
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Apply one action (n,) for one control step; return it as changed by events, before clipping.
+        """Apply one action (n,) for one control step.
+
+        Return it as changed by events, before clipping.
 
         Raises `NotFiniteError` for NaN or infinity, `MismatchError` for a wrong shape.
         """
@@ -171,7 +184,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return executed
 
     def simulate(self) -> None:
-        """Run one control step with the actuators' commands as they are, as `advance` does once it has set them."""
+        """Run one control step with the actuators' commands as they are, as `advance` does once
+        it has set them.
+        """
         self._begin_step()
         mujoco.mj_step(self.world.model, self.data, self.config.physics_steps)
         self.world.update()  # otherwise poses are those at the start of the last physics step
@@ -182,7 +197,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     @property
     def solved(self) -> bool:
-        """Whether the task is solved: it has been within the tolerance for the required number of steps in a row."""
+        """Whether the task is solved: it has been within the tolerance for the required number
+        of steps in a row.
+        """
         return self._streak >= self.config.success_steps
 
     @property
@@ -200,7 +217,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return min(1.0, max(0.0, self._task.progress(self.world)))
 
     def get_state(self) -> State:
-        """Return everything that the world's future depends on, which `set_state` restores bit for bit."""
+        """Return everything that the world's future depends on, which `set_state` restores bit
+        for bit.
+        """
         return State(
             self.world.physics(),
             self.world.variation.copy(),
@@ -212,7 +231,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         )
 
     def set_state(self, state: State) -> None:
-        """Restore a state of the same scene; one without a seed goes on with the events of the current episode.
+        """Restore a state of the same scene.
+
+        One without a seed goes on with the events of the current episode.
 
         Raises `MismatchError` for a state of another scene.
         """
@@ -226,10 +247,12 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._seen.clear()
 
     def observe(self) -> Observation:
-        """Return what a policy observes now, with the episode's delay and noise; call it once per control step.
+        """Return what a policy observes now, with the episode's delay and noise.
 
-        What happens to the world at the beginning of the control step, such as a knock, has happened then. The
-        observation has pictures only if the environment has cameras.
+        Call it once per control step.
+
+        What happens to the world at the beginning of the control step, such as a knock, has
+        happened then. The observation has pictures only if the environment has cameras.
         """
         self._begin_step()
         world = self._measured()
@@ -262,7 +285,10 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return World(self.scene)
 
     def render(self) -> Picture | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return a picture from the front camera, uint8 (480, 640, 3); None unless render_mode is `rgb_array`."""
+        """Return a picture from the front camera, uint8 (480, 640, 3).
+
+        None unless render_mode is `rgb_array`.
+        """
         if self.render_mode == "human":
             if self._window is None:
                 self._window = Window(self.scene, self.config.control_hz)
@@ -285,7 +311,10 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     def _observation(self) -> dict[str, Any]:
         seen = self.observe()
-        observation: dict[str, Any] = {"agent_pos": seen.state, "environment_state": seen.environment_state}
+        observation: dict[str, Any] = {
+            "agent_pos": seen.state,
+            "environment_state": seen.environment_state,
+        }
         if self.cameras:
             observation["pixels"] = seen.images
         return observation
@@ -315,6 +344,9 @@ def environment_state_names(scene: Scene) -> tuple[str, ...]:
     for name, value in scene.task.observe(world).items():
         if np.ndim(value) and np.shape(value) != (3,):
             shape = np.shape(value)
-            raise UsageError(f"observe of task {scene.task.name}: {name} has shape {shape}; expected a number or (3,)")
+            raise UsageError(
+                f"observe of task {scene.task.name}: {name} has shape {shape}; expected a number or"
+                " (3,)"
+            )
         names += [f"{name}.{axis}" for axis in "xyz"] if np.ndim(value) else [name]
     return tuple(names)

@@ -37,23 +37,31 @@ class Kind:
 
 
 def random_action(action: F64, world: World, rng: np.random.Generator) -> F64:
-    """Draw an action (n,): each joint within its longest step from the measured position, any gripper opening."""
+    """Draw an action (n,): each joint within its longest step from the measured position, any
+    gripper opening.
+    """
     return world.scene.actions.random_near(world.measured, rng)
 
 
 def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
-    """Return `action` (n,) with each joint's step reversed and the gripper command at the opposite end."""
+    """Return `action` (n,) with each joint's step reversed and the gripper command at the
+    opposite end.
+    """
     actions = world.scene.actions
     low, high = actions.low[actions.gripper], actions.high[actions.gripper]
     opposite = high if action[actions.gripper] < (low + high) / 2 else low
     return np.where(actions.relative, 2 * world.measured - action, opposite)
 
 
-def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> None:
-    """Move the first object of the episode a random distance sideways, to a place within reach, with zero velocity.
+def move_object(
+    world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0
+) -> None:
+    """Move the first object of the episode a random distance sideways, to a place within reach,
+    with zero velocity.
 
-    distance: least and greatest [m]. height: how far up it is moved [m]; above 0 it is also turned at random, and
-    falls. A place where it overlaps something is drawn again; nothing moves if there is no object or no free place.
+    distance: least and greatest [m]. height: how far up it is moved [m]; above 0 it is also turned
+    at random, and falls. A place where it overlaps something is drawn again; nothing moves if there
+    is no object or no free place.
     """
     if not world.scene.task.objects:
         return
@@ -70,16 +78,22 @@ def move_object(world: World, rng: np.random.Generator, distance: tuple[float, f
         if height > 0:
             turn = rng.normal(size=4)
             pose[3:] = turn / np.linalg.norm(turn)
-        if world.reach.has([*pose[:2], half]) and _is_on_table(world, pose) and _place(world, name, pose):
+        if (
+            world.reach.has([*pose[:2], half])
+            and _is_on_table(world, pose)
+            and _place(world, name, pose)
+        ):
             return
     world.restore(before, world.variation)
 
 
 def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None:
-    """Turn every arm joint and its command at random by up to `largest` [rad]; an object in the hand stays behind.
+    """Turn every arm joint and its command at random by up to `largest` [rad].
 
-    The arm then touches nothing that it did not touch before, and the hand is where it can point down. The arm stays
-    where it is if no such posture is found.
+    An object in the hand stays behind.
+
+    The arm then touches nothing that it did not touch before, and the hand is where it can point
+    down. The arm stays where it is if no such posture is found.
     """
     scene, data = world.scene, world.data
     low, high = (scene.actions.split(end)[0] for end in (scene.actions.low, scene.actions.high))
@@ -100,7 +114,9 @@ def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None
 
 
 def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
-    """Return (geom, geom, False) for each contact of the robot, and (geom, geom, True), too, if the geoms overlap."""
+    """Return (geom, geom, False) for each contact of the robot, and (geom, geom, True), too, if
+    the geoms overlap.
+    """
     model, contact = world.scene.model, world.data.contact
     robot = model.body_rootid[model.site_bodyid[world.scene.ee_site]]
     of_robot = (model.body_rootid[model.geom_bodyid[contact.geom]] == robot).any(axis=1)
@@ -114,7 +130,9 @@ def _open_gripper(world: World, rng: np.random.Generator) -> None:
 
 
 KINDS: dict[str, Kind] = {
-    "jolt": Kind("joints off by up to 0.2 rad", change=lambda world, rng: draw_posture(world, rng, _JOLT)),
+    "jolt": Kind(
+        "joints off by up to 0.2 rad", change=lambda world, rng: draw_posture(world, rng, _JOLT)
+    ),
     "dropped": Kind(
         "object dropped from 10 cm",
         change=lambda world, rng: move_object(world, rng, _SHIFT, _DROP),
@@ -132,7 +150,9 @@ def kinds_for(task: Task) -> dict[str, Kind]:
 
 
 class Perturbation(Condition):
-    """A condition under which one of `KINDS` happens once. moments: the control step at which it happens, by seed."""
+    """A condition under which one of `KINDS` happens once. moments: the control step at which it
+    happens, by seed.
+    """
 
     moments: Mapping[int, int]
 
@@ -141,7 +161,9 @@ class Perturbation(Condition):
         vars(self).update(moments=moments)
 
     def draw(self, seed: int) -> dict[str, Any]:
-        """Return the kind's name -> the control step at which it happens in the episode of a seed."""
+        """Return the kind's name -> the control step at which it happens in the episode of a
+        seed.
+        """
         return {self.name: self.moments[seed]}
 
 
@@ -154,19 +176,24 @@ STANDARD = Condition("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), kn
 
 
 class Events:
-    """Events of one episode: `drawn` says which, how strong and when; directions and noise are drawn from the seed."""
+    """Events of one episode: `drawn` says which, how strong and when.
+
+    Directions and noise are drawn from the seed.
+    """
 
     def __init__(self, world: World, drawn: Mapping[str, Any], seed: int):
         self._world = world
         self._drawn = drawn
         self._seed = seed
-        self._kinds = {moment: (name, KINDS[name]) for name, moment in drawn.items() if name in KINDS}
+        self._kinds = {
+            moment: (name, KINDS[name]) for name, moment in drawn.items() if name in KINDS
+        }
 
     def before(self, step: int) -> bool:
         """Apply the events of a step to the world; return whether a perturbation changed it.
 
-        A perturbation that finds no free place, or that changes nothing (fingers already open), leaves the world as
-        it was, bit for bit.
+        A perturbation that finds no free place, or that changes nothing (fingers already open),
+        leaves the world as it was, bit for bit.
         """
         world, drawn = self._world, self._drawn
         if step == drawn.get("knock_step"):
@@ -182,7 +209,9 @@ class Events:
         return False
 
     def action(self, action: F64, step: int) -> F64:
-        """Return the action (n,) that is executed at a step: `action`, with noise or replaced if an event says so."""
+        """Return the action (n,) that is executed at a step: `action`, with noise or replaced if
+        an event says so.
+        """
         name, kind = self._kinds.get(step, ("", None))
         if kind is not None and kind.wrong is not None:
             return kind.wrong(action, self._world, rng_for(self._seed, f"perturbation {name}"))
@@ -191,8 +220,8 @@ class Events:
             if rng.uniform() < share:
                 return random_action(action, self._world, rng)
         if share := self._drawn.get("action_noise"):
-            # As in Meta-World's tests of its experts, the noise is a share of each entry's range: twice the longest
-            # step for a joint, the whole range of openings for the gripper.
+            # As in Meta-World's tests of its experts, the noise is a share of each entry's range:
+            # twice the longest step for a joint, the whole range of openings for the gripper.
             actions = self._world.scene.actions
             noise = rng_for(self._seed, "action noise", step).normal(0.0, share, len(action))
             return action + noise * np.where(actions.relative, 2, 1) * actions.scale

@@ -20,9 +20,11 @@ _TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj))(?P<length>:\d*\.?\d+)?", r
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A closed mesh with its centre of mass at the origin: vertices (n, 3) [m], faces (m, 3), volume [m^3].
+    """A closed mesh with its centre of mass at the origin: vertices (n, 3) [m], faces (m, 3),
+    volume [m^3].
 
-    stored: the object's text in datasets, with the file's name and hash in place of its path. sha256: hash of the file.
+    stored: the object's text in datasets, with the file's name and hash in place of its path.
+    sha256: hash of the file.
     """
 
     stored: str
@@ -45,12 +47,18 @@ def parse_mesh(shape: Path) -> Mesh:
     """
     text = str(shape)
     if (found := _TEXT.fullmatch(text)) is None:
-        raise UsageError(f"object is {shorten(text)}; expected mesh:FILE or mesh:FILE:LENGTH [m], FILE an STL or OBJ")
+        raise UsageError(
+            f"object is {shorten(text)}; expected mesh:FILE or mesh:FILE:LENGTH [m], FILE an STL"
+            " or OBJ"
+        )
     return _read(Path(found["path"]), float((found["length"] or ":0")[1:]))
 
 
 def mesh_path(shape: NameOrPath) -> Path | None:
-    """Return the path in an object's text, as in `parse_mesh`; None for an object without a file."""
+    """Return the path in an object's text, as in `parse_mesh`.
+
+    None for an object without a file.
+    """
     found = _TEXT.fullmatch(str(shape)) if isinstance(shape, Path) else None
     return Path(found["path"]) if found else None
 
@@ -74,7 +82,9 @@ def _solid(path: Path, content: bytes) -> Any:
     suffix = path.suffix.lower()
     try:
         found = trimesh.load_mesh(
-            BytesIO(content), file_type=suffix[1:], **({"skip_materials": True} if suffix == ".obj" else {})
+            BytesIO(content),
+            file_type=suffix[1:],
+            **({"skip_materials": True} if suffix == ".obj" else {}),
         )
         solid = trimesh.Trimesh(found.vertices, found.faces)
     except Exception as error:

@@ -1,4 +1,6 @@
-"""Named keypoints of a scene: the positions that its task observes, and the upper corners of its boxes."""
+"""Named keypoints of a scene: the positions that its task observes, and the upper corners of its
+boxes.
+"""
 
 from functools import lru_cache
 from itertools import product
@@ -17,8 +19,8 @@ _CORNERS = 4  # a box's upper corners, which cameras see
 def points_in(world: World) -> dict[str, F64]:
     """Return the keypoints: name -> position (3,) [m].
 
-    A vector that the task observes is a keypoint if it has the name of a body, geom or site. The upper corners of a box
-    are numbered by their direction from its centre, seen from above.
+    A vector that the task observes is a keypoint if it has the name of a body, geom or site. The
+    upper corners of a box are numbered by their direction from its centre, seen from above.
     """
     model = world.scene.model
     found = {
@@ -28,7 +30,10 @@ def points_in(world: World) -> dict[str, F64]:
     }
     for name, one in world.scene.objects.items():
         if model.geom_type[one.geom] == mujoco.mjtGeom.mjGEOM_BOX:
-            found |= {f"{name}.corner_{number}": at for number, at in enumerate(_upper_corners(world, name))}
+            found |= {
+                f"{name}.corner_{number}": at
+                for number, at in enumerate(_upper_corners(world, name))
+            }
     return found
 
 

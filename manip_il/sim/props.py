@@ -14,7 +14,8 @@ from manip_il.sim.world import GOAL, Scene
 
 VERSION = 3  # version of the look of these objects, part of the fingerprint of pictures
 _POLE, _SHORTEST = 0.003, 0.03  # radius of a goal's pole, and its least height [m]
-_FOOT, _ARM = 1.2, 1.6  # radius of a goal's foot, half the length of its cross, in radii of the largest object
+# radius of a goal's foot, half the length of its cross, in radii of the largest object
+_FOOT, _ARM = 1.2, 1.6
 _THIN, _GOAL = 0.001, 0.02  # height of a foot, radius of a goal [m]
 _UP = np.eye(3)
 _ACROSS = (
@@ -23,14 +24,18 @@ _ACROSS = (
 )  # rotations that turn z along x, and along y
 _STAND = (0.10, 0.55, 0.28, 1.0)  # the stand's colour
 _KINDS = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
-_HALF = (0.012, 0.04)  # range of a clutter object's half lengths, for a workspace as large as Panda's [m]
-_BESIDE, _WITHIN = 0.06, 0.24  # least and greatest distance of clutter from the workspace's edge [m]
+# range of a clutter object's half lengths, for a workspace as large as Panda's [m]
+_HALF = (0.012, 0.04)
+# least and greatest distance of clutter from the workspace's edge [m]
+_BESIDE, _WITHIN = 0.06, 0.24
 _FROM_BASE = 0.18  # least horizontal distance of clutter from the robot's first joint [m]
 _DRAWS = 50  # draws of a clutter object's place before it is left out
 
 
 class Prop(NamedTuple):
-    """An object to draw: MuJoCo's geom type and size (3,), position (3,) [m], rotation (3, 3) and colour (RGBA)."""
+    """An object to draw: MuJoCo's geom type and size (3,), position (3,) [m], rotation (3, 3)
+    and colour (RGBA).
+    """
 
     kind: int
     size: F64
@@ -41,13 +46,17 @@ class Prop(NamedTuple):
     def add_to(self, scene: Any) -> None:
         """Add the object to `scene`, MuJoCo's list of geoms to draw next."""
         geom, colour = scene.geoms[scene.ngeom], np.array(self.colour, np.float32)
-        mujoco.mjv_initGeom(geom, self.kind, self.size, self.position, self.rotation.ravel(), colour)
+        mujoco.mjv_initGeom(
+            geom, self.kind, self.size, self.position, self.rotation.ravel(), colour
+        )
         geom.category = mujoco.mjtCatBit.mjCAT_STATIC
         scene.ngeom += 1
 
 
 def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0, 0)) -> list[Prop]:
-    """Return the visual objects of a scene's world; poses of mocap bodies and joints in `data` must be up to date.
+    """Return the visual objects of a scene's world.
+
+    Poses of mocap bodies and joints in `data` must be up to date.
 
     clutter: (2,) largest number of objects, and the seed of their kinds and places.
     """
@@ -55,7 +64,9 @@ def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0
 
 
 def _stand(scene: Scene, data: mujoco.MjData) -> list[Prop]:
-    """The stand of a goal, wider than an object there: a foot on the table, or a pole with a cross in the air."""
+    """The stand of a goal, wider than an object there: a foot on the table, or a pole with a
+    cross in the air.
+    """
     body = mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, GOAL)
     if body < 0:
         return []
@@ -63,11 +74,17 @@ def _stand(scene: Scene, data: mujoco.MjData) -> list[Prop]:
     if z < 0:
         return []
     scale = scene.scale
-    largest = max((float(scene.model.geom_rbound[one.geom]) for one in scene.objects.values()), default=_GOAL * scale)
+    largest = max(
+        (float(scene.model.geom_rbound[one.geom]) for one in scene.objects.values()),
+        default=_GOAL * scale,
+    )
     if z <= _SHORTEST:
         return [_cylinder((x, y, _THIN / 2), _UP, _FOOT * largest, _THIN)]
     pole = _cylinder((x, y, z / 2), _UP, _POLE * scale, z)
-    return [pole, *(_cylinder((x, y, z), along, _POLE * scale, 2 * _ARM * largest) for along in _ACROSS)]
+    return [
+        pole,
+        *(_cylinder((x, y, z), along, _POLE * scale, 2 * _ARM * largest) for along in _ACROSS),
+    ]
 
 
 def _cylinder(at: tuple[float, float, float], rotation: F64, radius: float, length: float) -> Prop:
@@ -93,17 +110,27 @@ def _clutter(scene: Scene, data: mujoco.MjData, count: int, seed: int) -> list[P
 
 
 def _thing(rng: np.random.Generator, scene: Scene) -> tuple[Prop, float, float]:
-    """A box, cylinder or ball of any colour, turned about the vertical; its radius from above, half its height [m]."""
+    """A box, cylinder or ball of any colour, turned about the vertical.
+
+    Its radius from above, half its height [m].
+    """
     number = int(rng.integers(len(_KINDS)))
     x, y, z = (rng.uniform(*_HALF, 3) * scene.scale).tolist()
-    size, radius, height = (((x, y, z), math.hypot(x, y), z), ((x, z, 0.0), x, z), ((x, 0.0, 0.0), x, x))[number]
+    size, radius, height = (
+        ((x, y, z), math.hypot(x, y), z),
+        ((x, z, 0.0), x, z),
+        ((x, 0.0, 0.0), x, x),
+    )[number]
     yaw, colour = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.95, 3)
     prop = Prop(int(_KINDS[number]), np.array(size), np.zeros(3), turn_about_z(yaw), (*colour, 1.0))
     return prop, radius, height
 
 
 def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> list[float]:
-    """A random place on the table around the workspace; [] if it is in the workspace or near the robot's base."""
+    """A random place on the table around the workspace.
+
+    [] if it is in the workspace or near the robot's base.
+    """
     space = scene.robot.workspace
     outer = space.half_width + _WITHIN
     x, y = rng.uniform(-outer, outer, 2).tolist()

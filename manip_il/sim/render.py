@@ -1,4 +1,6 @@
-"""Off-screen pictures of a simulator state: one OpenGL context per thread, for any number of environments."""
+"""Off-screen pictures of a simulator state: one OpenGL context per thread, for any number of
+environments.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ from manip_il.sim.world import Scene
 
 Picture = NDArray[np.uint8]
 PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1"
-REMEDY = f"unset MUJOCO_GL if it is set; on Debian: apt-get install -y {PACKAGES}"  # if no picture can be rendered
+# if no picture can be rendered
+REMEDY = f"unset MUJOCO_GL if it is set; on Debian: apt-get install -y {PACKAGES}"
 _FINER = 2  # supersampling each way: cheaper than OpenGL's antialiasing, which redraws the meshes
 _MAX_GEOMS = 1_000
 _EE = 4  # group of the site `ee`, the robot's only one
@@ -35,11 +38,12 @@ _AXES = 0.06, 0.006  # length and thickness of the axes drawn at `ee` [m]
 def pictures(
     scene: Scene, data: mujoco.MjData, cameras: CameraConfig, variation: F64 | None = None
 ) -> dict[str, Picture]:
-    """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
+    """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width,
+    3).
 
-    variation: the world's (v,), by default the scene's own. A picture's bytes depend only on the variation, `qpos`
-    and mocap poses, not on earlier pictures.
-    Raises `RenderError`, which says what to unset or install, if there is no off-screen OpenGL.
+    variation: the world's (v,), by default the scene's own. A picture's bytes depend only on the
+    variation, `qpos` and mocap poses, not on earlier pictures. Raises `RenderError`, which says
+    what to unset or install, if there is no off-screen OpenGL.
     """
     renderer = _renderer(scene, cameras.look)
     renderer.pose(data, scene.nominal if variation is None else variation)
@@ -47,20 +51,27 @@ def pictures(
 
 
 def projections(scene: Scene, cameras: CameraConfig, points: F64) -> dict[str, F32]:
-    """Return where points (K, 3) of the world [m] are in this thread's last `pictures`: name -> (K, 3).
+    """Return where points (K, 3) of the world [m] are in this thread's last `pictures`: name -> (K,
+    3).
 
-    Columns: position across and down, each from 0 to 1, then 1. All three are 0 for a point outside the picture. A
-    point inside may be hidden behind others. Raises `RenderError` as `pictures` does.
+    Columns: position across and down, each from 0 to 1, then 1. All three are 0 for a point outside
+    the picture. A point inside may be hidden behind others. Raises `RenderError` as `pictures`
+    does.
     """
     renderer = _renderer(scene, cameras.look)
-    return {name: renderer.project(name, points, cameras.width / cameras.height) for name in cameras.names}
+    return {
+        name: renderer.project(name, points, cameras.width / cameras.height)
+        for name in cameras.names
+    }
 
 
-def framed_picture(scene: Scene, data: mujoco.MjData, camera: str, size: tuple[int, int], look: Look) -> Picture:
+def framed_picture(
+    scene: Scene, data: mujoco.MjData, camera: str, size: tuple[int, int], look: Look
+) -> Picture:
     """Return what a camera sees of the physics in `data`, with the axes of `ee` drawn in.
 
-    The x axis is red, y green, z blue. size: height and width [pixels]. The picture is RGB, uint8 (height, width, 3).
-    Raises `RenderError` as `pictures` does.
+    The x axis is red, y green, z blue. size: height and width [pixels]. The picture is RGB, uint8
+    (height, width, 3). Raises `RenderError` as `pictures` does.
     """
     renderer = _renderer(scene, look)
     renderer.pose(data, scene.nominal)
@@ -78,20 +89,28 @@ def close() -> None:
 
 
 def _renderer(scene: Scene, look: Look) -> _Renderer:
-    """The renderer that was used last, or a new one in its place, in this thread's OpenGL context."""
+    """The renderer that was used last, or a new one in its place, in this thread's OpenGL
+    context.
+    """
     try:
         _context().make_current()
         return _prepared(scene, look)
     except Exception as error:  # mujoco raises many kinds of errors, from ImportError to its own
-        raise RenderError(f"no off-screen OpenGL ({type(error).__name__}: {error}); {REMEDY}") from error
+        raise RenderError(
+            f"no off-screen OpenGL ({type(error).__name__}: {error}); {REMEDY}"
+        ) from error
 
 
 @cached_per_thread()
 def _context() -> Any:
     """This thread's OpenGL context."""
-    backend = os.environ.get("MUJOCO_GL", "").lower().strip()  # mujoco may have been imported before it was set
-    made_by = import_module(f"mujoco.{backend if backend in ('egl', 'osmesa') else 'glfw'}").GLContext
-    setattr(made_by, "_context", None)  # noqa: B010 - its destructor needs it even if its constructor failed
+    # mujoco may have been imported before it was set
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip()
+    made_by = import_module(
+        f"mujoco.{backend if backend in ('egl', 'osmesa') else 'glfw'}"
+    ).GLContext
+    # its destructor needs it even if its constructor failed
+    setattr(made_by, "_context", None)  # noqa: B010
     gl = made_by(1, 1)  # any size will do, as pictures have a buffer of their own
     atexit.register(close)
     return gl
@@ -137,21 +156,31 @@ class _Renderer:
             mujoco.mjr_resizeOffscreen(max(width, have[1]), max(height, have[0]), self._context)
         self._camera.fixedcamid = self._cameras[camera]
         everything, frame = mujoco.mjtCatBit.mjCAT_ALL, mujoco.mjtFrame
-        self._option.frame, self._option.sitegroup[_EE] = (frame.mjFRAME_SITE if axes else frame.mjFRAME_NONE), axes
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._camera, everything, self._scene)
+        self._option.frame, self._option.sitegroup[_EE] = (
+            (frame.mjFRAME_SITE if axes else frame.mjFRAME_NONE),
+            axes,
+        )
+        mujoco.mjv_updateScene(
+            self._model, self._data, self._option, None, self._camera, everything, self._scene
+        )
         for prop in self._props:
             prop.add_to(self._scene)
         fine = np.empty((height, width, 3), dtype=np.uint8)
         view = mujoco.MjrRect(0, 0, width, height)
         mujoco.mjr_render(view, self._scene, self._context)
         mujoco.mjr_readPixels(fine, None, view, self._context)
-        return np.asarray(Image.fromarray(fine).reduce(_FINER))[::-1].copy()  # OpenGL counts rows from below
+        # OpenGL counts rows from below
+        return np.asarray(Image.fromarray(fine).reduce(_FINER))[::-1].copy()
 
     def project(self, camera: str, points: F64, aspect: float) -> F32:
         number = self._cameras[camera]
-        x, y, back = self._data.cam_xmat[number].reshape(3, 3).T @ (points - self._data.cam_xpos[number]).T
+        x, y, back = (
+            self._data.cam_xmat[number].reshape(3, 3).T @ (points - self._data.cam_xpos[number]).T
+        )
         ahead = np.where(back < 0, -back, np.inf)
         half = ahead * math.tan(math.radians(self._model.cam_fovy[number]) / 2)
-        found = np.stack([0.5 + x / (2 * half * aspect), 0.5 - y / (2 * half), np.ones_like(x)], axis=1)
+        found = np.stack(
+            [0.5 + x / (2 * half * aspect), 0.5 - y / (2 * half), np.ones_like(x)], axis=1
+        )
         inside = ((found[:, :2] >= 0) & (found[:, :2] <= 1)).all(axis=1) & np.isfinite(ahead)
         return np.where(inside[:, None], found, 0.0).astype(np.float32)

@@ -20,13 +20,16 @@ DEEPEST = 0.035  # depth of the ee site below an object's top at which the palm 
 LEAST_HEIGHT = 0.012  # least height of an object on the table: fingers slip over lower ones [m]
 LEAST_ROOM = 0.002  # least clearance of an open gripper around an object [m]
 _DIRECTIONS = 500  # of a hull with more points, only the outermost in this many directions are kept
-_ALIKE, _COPLANAR = 0.2, 0.01  # angles between sides that count as one, and between faces of one side [rad]
+# angles between sides that count as one, and between faces of one side [rad]
+_ALIKE, _COPLANAR = 0.2, 0.01
 _FINGER = 0.012  # half a finger's width plus its sideways error [m]
 _LEVEL = 0.004  # spacing of the heights at which widths are measured [m]
 _TIP = 0.001  # height of the lowest of those levels over the fingertips [m]
 _APART = math.radians(25)  # least angle between two grasps [rad]
-_SLOPE = 0.1  # slope of the sides at the fingertips above which the object is grasped as low as possible
-_STEEP = 0.2  # grasps whose slope at the fingertips exceeds the smallest by more than this are dropped
+# slope of the sides at the fingertips above which the object is grasped as low as possible
+_SLOPE = 0.1
+# grasps whose slope at the fingertips exceeds the smallest by more than this are dropped
+_STEEP = 0.2
 _WIDER = 0.02  # grasps wider than the narrowest by more than this are dropped [m]
 _ROUND = 0.03  # largest variation of a round object's width, as a share of it
 
@@ -34,11 +37,12 @@ _ROUND = 0.03  # largest variation of a round object's width, as a share of it
 class Rest(NamedTuple):
     """A side on which an object rests.
 
-    down: unit vector (3,), in the object's frame, that points down when the object rests on the side. Heights [m]:
-    `height` of the body's origin over the table, `tall` of the object, `above` of its top over the grasp. For each of w
-    grasps: across (w, 3), unit vector along the fingers' motion; centre (w, 3), middle between the fingers [m]; sizes,
-    the object's width between the fingers and its length at right angles to that [m]. fits: whether the object is
-    narrow enough for the open fingers, and tall enough to grip. round: whether any yaw will do.
+    down: unit vector (3,), in the object's frame, that points down when the object rests on the
+    side. Heights [m]: `height` of the body's origin over the table, `tall` of the object, `above`
+    of its top over the grasp. For each of w grasps: across (w, 3), unit vector along the fingers'
+    motion; centre (w, 3), middle between the fingers [m]; sizes, the object's width between the
+    fingers and its length at right angles to that [m]. fits: whether the object is narrow enough
+    for the open fingers, and tall enough to grip. round: whether any yaw will do.
     """
 
     down: F64
@@ -55,12 +59,15 @@ class Rest(NamedTuple):
 class Hull:
     """An object's convex hull, and the sides on which it rests, for one gripper.
 
-    extents: lengths of the box around it, centred on the body's origin [m]. downs: for each side the unit vector that
-    points down when the object rests on it, (n, 3); the first is the nearest to down as the object was modelled.
+    extents: lengths of the box around it, centred on the body's origin [m]. downs: for each side
+    the unit vector that points down when the object rests on it, (n, 3); the first is the nearest
+    to down as the object was modelled.
     """
 
     def __init__(self, model: mujoco.MjModel, body: int, geom: int, lowest: float, widest: float):
-        """Use a body's mesh, and a gripper that opens to `widest` [m] and whose `ee` gets down to `lowest` [m]."""
+        """Use a body's mesh, and a gripper that opens to `widest` [m] and whose `ee` gets down
+        to `lowest` [m].
+        """
         points = _few(_vertices(model, geom))
         self._hull = ConvexHull(points)
         self._centre = model.body_ipos[body].copy()
@@ -72,7 +79,9 @@ class Hull:
     def rest(self, number: int) -> Rest:
         """Return how the object rests on the side `downs[number]`, computed on first use."""
         if number not in self._rests:
-            self._rests[number] = _rest(self._hull, self._centre, self.downs[number], *self._gripper)
+            self._rests[number] = _rest(
+                self._hull, self._centre, self.downs[number], *self._gripper
+            )
         return self._rests[number]
 
 
@@ -90,13 +99,15 @@ def _few(points: F64) -> F64:
     if len(points) <= _DIRECTIONS:
         return points
     number = np.arange(_DIRECTIONS) + 0.5
-    z, turn = 1 - 2 * number / _DIRECTIONS, number * math.pi * (1 + math.sqrt(5))  # Fibonacci sphere
+    # Fibonacci sphere
+    z, turn = 1 - 2 * number / _DIRECTIONS, number * math.pi * (1 + math.sqrt(5))
     ways = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
     return points[np.unique((points @ ways).argmax(axis=0))]
 
 
 def _resting(hull: ConvexHull, centre: F64) -> F64:
-    """Outward normals (n, 3) of the stable sides: the one facing most downwards, then the most stable first.
+    """Outward normals (n, 3) of the stable sides: the one facing most downwards, then the most
+    stable first.
 
     A side is stable if the centre of mass is over it or, owing to rolling friction, nearly so.
     """
@@ -105,7 +116,8 @@ def _resting(hull: ConvexHull, centre: F64) -> F64:
     cosines = normals @ normals.T
     apart = cosines < math.cos(_COPLANAR)
     sines = np.sqrt(np.maximum(1 - cosines**2, 1e-12))
-    room = np.where(apart, (heights - cosines * heights[:, None]) / sines, np.inf).min(axis=1)  # to the side's edges
+    # to the side's edges
+    room = np.where(apart, (heights - cosines * heights[:, None]) / sines, np.inf).min(axis=1)
     stable = np.flatnonzero((room > 0) | (heights == heights.min()))
     order = np.argsort(-room / heights, kind="stable")
     downs = [normals[stable[np.argmin(normals[stable, 2])]]]
@@ -124,12 +136,16 @@ def _rest(hull: ConvexHull, centre: F64, down: F64, lowest: float, widest: float
     flat, turns = (hull.points - centre) @ axes.T, _turns(hull, axes)
     deepest = max(lowest, tall - DEEPEST)
     for at in (max(deepest, min(height, tall / 2)), deepest):  # heights of the hand over the table
-        ways, any_yaw = _ways(_all_ways(hull, heights + height, flat, at - lowest, turns), widest - LEAST_ROOM)
+        ways, any_yaw = _ways(
+            _all_ways(hull, heights + height, flat, at - lowest, turns), widest - LEAST_ROOM
+        )
         if min(way.slope for way in ways) <= _SLOPE:  # else it narrows upwards: grasp lower
             break
     turned = np.array([[math.cos(way.turn), math.sin(way.turn)] for way in ways])
     across = turned @ axes
-    middle = centre + (at - height) * -down + np.array([way.middle for way in ways])[:, None] * across
+    middle = (
+        centre + (at - height) * -down + np.array([way.middle for way in ways])[:, None] * across
+    )
     return Rest(
         down=down,
         height=float((hull.points @ down).max()),
@@ -160,16 +176,23 @@ def _cut(hull: ConvexHull, heights: F64, flat: F64, level: float) -> F64:
 
 
 def _turns(hull: ConvexHull, axes: F64) -> F64:
-    """Candidate directions of the fingers' motion [rad]: all around, and flush with upright sides if these are few."""
+    """Candidate directions of the fingers' motion [rad]: all around, and flush with upright
+    sides if these are few.
+    """
     sides = hull.equations[:, :3] @ axes.T
     upright = sides[np.hypot(*sides.T) > 0.7]
     flush = np.unique(np.degrees(np.arctan2(upright[:, 1], upright[:, 0])).round(1) % 180)
     around = np.arange(0, 180, 5.0)
-    return np.radians(np.unique(np.concatenate([around, flush])) if len(flush) < len(around) else around)
+    return np.radians(
+        np.unique(np.concatenate([around, flush])) if len(flush) < len(around) else around
+    )
 
 
 class _Way(NamedTuple):
-    """A grasp. turn: direction of the fingers' motion [rad]; middle: offset along it from the centre of mass [m]."""
+    """A grasp. turn: direction of the fingers' motion [rad].
+
+    middle: offset along it from the centre of mass [m].
+    """
 
     turn: float
     width: float
@@ -179,7 +202,10 @@ class _Way(NamedTuple):
 
 
 def _ways(ways: Sequence[_Way], widest: float) -> tuple[list[_Way], bool]:
-    """The locally narrowest grasps that fit, or the narrowest if none does; and whether any yaw will do."""
+    """The locally narrowest grasps that fit, or the narrowest if none does.
+
+    And whether any yaw will do.
+    """
     narrowest = min(ways, key=lambda way: way.width)
     fitting = [way for way in ways if way.width <= min(widest, narrowest.width + _WIDER)]
     if max(way.width for way in ways) - narrowest.width < _ROUND * narrowest.width:
@@ -213,9 +239,18 @@ def _way(cuts: Sequence[F64], turn: float) -> _Way:
     low, high = np.array(ends).T
     up = min(2, len(ends) - 1)
     rise = max(up * _LEVEL, _LEVEL)
-    steep = max((low[up] - low[0]) * (low.argmin() == 0), (high[0] - high[up]) * (high.argmax() == 0)) / rise
+    steep = (
+        max((low[up] - low[0]) * (low.argmin() == 0), (high[0] - high[up]) * (high.argmax() == 0))
+        / rise
+    )
     length = float(np.max(lengths) - np.min(lengths))
-    return _Way(turn, float(high.max() - low.min()), length, float(high.max() + low.min()) / 2, max(0.0, float(steep)))
+    return _Way(
+        turn,
+        float(high.max() - low.min()),
+        length,
+        float(high.max() + low.min()) / 2,
+        max(0.0, float(steep)),
+    )
 
 
 def _between(one: float, other: float) -> float:

@@ -26,13 +26,16 @@ _EMPTY = Path(__file__).with_name("empty.xml")
 PREFIX = "robot/"  # prefix of the robot's names in a scene
 TABLE = "table"  # name of the table's geom
 _THICK = 0.04  # thickness of the table's top [m]
-_TURN, _SPARE_TURN = 0.1, 0.1  # test rotation of the last joint, to find its direction; margin to its limits [rad]
-_SEEN_HEIGHT = 0.45  # height of the workspace for which `_CAMERAS` are placed; its half width is `USUAL` [m]
-# Camera positions, from the workspace's middle on the table; height above it of the point that they look at; vertical
-# field of view.
+# test rotation of the last joint, to find its direction; margin to its limits [rad]
+_TURN, _SPARE_TURN = 0.1, 0.1
+# height of the workspace for which `_CAMERAS` are placed; its half width is `USUAL` [m]
+_SEEN_HEIGHT = 0.45
+# Camera positions, from the workspace's middle on the table; height above it of the point that they
+# look at; vertical field of view.
 _CAMERAS = {"front": (0.80, -0.15, 0.55), "side": (-0.05, -0.80, 0.50)}  # [m]
 _LOOK_AT, _FIELD = 0.17, 42.0  # [m], [deg]
-_ON_TABLE = 0.02  # a robot stands on the table only if its lowest point is this near to the table's top [m]
+# a robot stands on the table only if its lowest point is this near to the table's top [m]
+_ON_TABLE = 0.02
 _PEDESTAL = 0.13  # half the pedestal's width [m]
 
 
@@ -40,8 +43,8 @@ _PEDESTAL = 0.13  # half the pedestal's width [m]
 def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
     """Return the scene of a robot and a task, compiled once and cached.
 
-    step: physics time step [s]. Raises `UsageError` if the scene does not compile, lacks an object of the task,
-    or has one to grasp that is too wide for the gripper.
+    step: physics time step [s]. Raises `UsageError` if the scene does not compile, lacks an object
+    of the task, or has one to grasp that is too wide for the gripper.
     """
     task = task.fitted(robot)
     try:
@@ -51,7 +54,8 @@ def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
     except ValueError as error:
         why = " ".join(str(error).split())
         raise UsageError(
-            f"the scene of robot {robot.name} ({robot.files.model}) and task {task.name} does not compile: {why}"
+            f"the scene of robot {robot.name} ({robot.files.model}) and task {task.name} does not"
+            f" compile: {why}"
         ) from None
     scene = _index(robot, task, model)
     _check_objects(scene)
@@ -103,7 +107,9 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
         actions=_action_space(robot, joints, gripper),
         objects=objects,
         arm_q=arm_q,
-        arm_ctrl=np.array([model.actuator(PREFIX + name).id for name in robot.joints], dtype=np.int64),
+        arm_ctrl=np.array(
+            [model.actuator(PREFIX + name).id for name in robot.joints], dtype=np.int64
+        ),
         ee_site=model.site(PREFIX + "ee").id,
         shoulder=joints[0].id,
         yaws=_yaws(robot, model, joints, arm_q),
@@ -112,8 +118,12 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
     )
 
 
-def _yaws(robot: Robot, model: mujoco.MjModel, joints: list[Any], arm_q: Any) -> tuple[float, float]:
-    """Least and greatest yaw to which a robot's last joint turns the hand, relative to `yaw_ahead` [rad]."""
+def _yaws(
+    robot: Robot, model: mujoco.MjModel, joints: list[Any], arm_q: Any
+) -> tuple[float, float]:
+    """Least and greatest yaw to which a robot's last joint turns the hand, relative to
+    `yaw_ahead` [rad].
+    """
     if not robot.faces_ahead or not joints[-1].limited[0]:
         return -np.inf, np.inf
     data, yaws = mujoco.MjData(model), []
@@ -135,12 +145,16 @@ def _objects(model: mujoco.MjModel) -> dict[str, Object]:
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
         body = int(model.jnt_bodyid[joint])
         name, geom = model.body(body).name, int(model.body_geomadr[body])
-        objects[name] = Object(name, body, geom, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
+        objects[name] = Object(
+            name, body, geom, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        )
     return objects
 
 
 def _check_objects(scene: Scene) -> None:
-    """Raise `UsageError` for an object that the scene does not have, or that is too wide or too low to grip."""
+    """Raise `UsageError` for an object that the scene does not have, or that is too wide or too
+    low to grip.
+    """
     task, model, most = scene.task, scene.model, scene.gripper.most
     for name in (*task.objects, *task.grasped):
         if name not in scene.objects:
@@ -152,20 +166,24 @@ def _check_objects(scene: Scene) -> None:
             rest = scene.hulls[name].rest(0)
             width, fits = min(width for width, _ in rest.sizes), rest.fits
             high = (
-                f"rests {rest.tall:.3f} m high ({LEAST_HEIGHT} m is the least; {LEAST_ROOM} m beside it must be free), "
+                f"rests {rest.tall:.3f} m high ({LEAST_HEIGHT} m is the least; {LEAST_ROOM} m"
+                " beside it must be free), "
             )
-        elif kind in variation.KINDS:  # width between the fingers if the object lies on its worst side
-            width = float(np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0])
+        # width between the fingers if the object lies on its worst side
+        elif kind in variation.KINDS:
+            width = float(
+                np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0]
+            )
             fits = width < most
         else:
             raise UsageError(
-                f"task {task.name}: the first geom of {name!r} is of MuJoCo's type {kind}; expected "
-                f"{', '.join(variation.GEOMS)} or mesh"
+                f"task {task.name}: the first geom of {name!r} is of MuJoCo's type {kind}; expected"
+                f" {', '.join(variation.GEOMS)} or mesh"
             )
         if not fits:
             raise UsageError(
-                f"task {task.name}: {name!r} {high}is {width:.3f} m wide, and the gripper of {scene.robot.name} opens "
-                f"to {most:.3f} m; choose another object, task or robot"
+                f"task {task.name}: {name!r} {high}is {width:.3f} m wide, and the gripper of"
+                f" {scene.robot.name} opens to {most:.3f} m; choose another object, task or robot"
             )
 
 
@@ -193,7 +211,11 @@ def _fit_table(spec: mujoco.MjSpec, robot: Robot) -> None:
     for i, (sx, sy) in enumerate(product((1, -1), repeat=2)):
         leg = spec.geom(f"leg{i}")
         leg.size = [0.025, 0.025, round((table.height - _THICK) / 2, 9)]
-        leg.pos = [middle[0] + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -(table.height + _THICK) / 2]
+        leg.pos = [
+            middle[0] + sx * (half[0] - 0.05),
+            y + sy * (half[1] - 0.05),
+            -(table.height + _THICK) / 2,
+        ]
     spec.geom("floor").pos = [0, 0, -table.height]
 
 
@@ -202,7 +224,9 @@ def _table_x(robot: Robot) -> float:
 
 
 def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> None:
-    """Add a pedestal from the floor to the robot's lowest point, unless the robot stands on the floor or the table."""
+    """Add a pedestal from the floor to the robot's lowest point, unless the robot stands on the
+    floor or the table.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     fixed = model.body_weldid[model.geom_bodyid] == 0
@@ -213,7 +237,10 @@ def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> N
     lowest = min(float(one[:, 2].min()) for one in placed)
     floor = -robot.table.height
     height = lowest - 0.01 - floor
-    on_table = abs(lowest) < _ON_TABLE and abs(middles[:, 0].mean() - _table_x(robot)) < robot.table.size[0] / 2
+    on_table = (
+        abs(lowest) < _ON_TABLE
+        and abs(middles[:, 0].mean() - _table_x(robot)) < robot.table.size[0] / 2
+    )
     if height <= 0.02 or on_table:
         return
     x, y = middles.mean(axis=0)
@@ -231,5 +258,9 @@ def _add_cameras(spec: mujoco.MjSpec, robot: Robot) -> None:
     scale = max(space.half_width / USUAL, space.height / _SEEN_HEIGHT)
     middle, at = np.array([*space.centre, 0.0]), np.array([*space.centre, _LOOK_AT * scale])
     for name, way in _CAMERAS.items():
-        pose = robot.cameras.get(name) or CameraPose(tuple(middle + scale * np.array(way)), tuple(at), _FIELD)
-        spec.worldbody.add_camera(name=name, pos=pose.position, quat=pose.quaternion, fovy=pose.fovy)
+        pose = robot.cameras.get(name) or CameraPose(
+            tuple(middle + scale * np.array(way)), tuple(at), _FIELD
+        )
+        spec.worldbody.add_camera(
+            name=name, pos=pose.position, quat=pose.quaternion, fovy=pose.fovy
+        )

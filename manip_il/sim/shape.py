@@ -1,4 +1,6 @@
-"""Shapes and sizes of the object that a task moves, as text: `cylinder:0.04`, `box:0.06x0.03x0.03`."""
+"""Shapes and sizes of the object that a task moves, as text: `cylinder:0.04`,
+`box:0.06x0.03x0.03`.
+"""
 
 from __future__ import annotations
 
@@ -31,19 +33,22 @@ _SIZES[ANY] = "WIDTH"
 MESH = "mesh"
 LONGEST_MESH = 0.2  # [m]
 SHAPE_HELP = (
-    "box, cylinder, sphere, capsule or any (one of these in each episode), with lengths [m] as in "
-    "cylinder:0.04x0.08, box:0.06x0.03x0.03; or a mesh file with the length of its longest side, mesh:mug.obj:0.1"
+    "box, cylinder, sphere, capsule or any (one of these in each episode), with lengths [m] as in"
+    " cylinder:0.04x0.08, box:0.06x0.03x0.03; or a mesh file with the length of its longest side,"
+    " mesh:mug.obj:0.1"
 )
 
 
 @dataclass(frozen=True)
 class ObjectShape:
-    """A wooden solid. kind: one of `KINDS`, `mesh` or `any`; lengths: along its own axes x, y and z [m].
+    """A wooden solid. kind: one of `KINDS`, `mesh` or `any`.
+
+    lengths: along its own axes x, y and z [m].
 
     `any`: each episode draws one of `KINDS`, of the same width; a cube if nothing is drawn.
-    Cylinders and capsules have their axis along z, and a capsule's length is that between the tips of its round ends.
-    Raises `UsageError` for a length outside `SHORTEST` to `LONGEST` (for a mesh, only the longest counts, and it may be
-    `LONGEST_MESH`), or a capsule no longer than wide.
+    Cylinders and capsules have their axis along z, and a capsule's length is that between the tips
+    of its round ends. Raises `UsageError` for a length outside `SHORTEST` to `LONGEST` (for a mesh,
+    only the longest counts, and it may be `LONGEST_MESH`), or a capsule no longer than wide.
     """
 
     kind: str
@@ -54,21 +59,26 @@ class ObjectShape:
         if self.mesh is not None:
             if not SHORTEST <= max(self.lengths) <= LONGEST_MESH:
                 raise UsageError(
-                    f"{self.mesh.stored} is {max(self.lengths):.3g} m long; expected {SHORTEST} to {LONGEST_MESH} m: "
-                    "give the length of its longest side, as in mesh:mug.obj:0.1"
+                    f"{self.mesh.stored} is {max(self.lengths):.3g} m long; expected {SHORTEST} to"
+                    f" {LONGEST_MESH} m: give the length of its longest side, as in"
+                    " mesh:mug.obj:0.1"
                 )
             return
         for length in self.lengths:
             if not SHORTEST <= length <= LONGEST:
-                raise UsageError(f"{self.kind} has a length of {length:g} m; expected {SHORTEST} to {LONGEST} m")
+                raise UsageError(
+                    f"{self.kind} has a length of {length:g} m; expected {SHORTEST} to {LONGEST} m"
+                )
         if self.kind == "capsule" and self.lengths[2] <= self.lengths[0]:
             raise UsageError(
-                f"capsule is {self.lengths[2]:g} m long and {self.lengths[0]:g} m wide; it must be longer than wide"
+                f"capsule is {self.lengths[2]:g} m long and {self.lengths[0]:g} m wide; it must be"
+                " longer than wide"
             )
 
     @classmethod
     def parse(cls, text: NameOrPath) -> ObjectShape:
-        """Return the shape that a text describes, or a mesh, which only a `Path` can name (see `option.typed`).
+        """Return the shape that a text describes, or a mesh, which only a `Path` can name (see
+        `option.typed`).
 
         Raises `UnknownName` or `UsageError`.
         """
@@ -80,18 +90,25 @@ class ObjectShape:
         kind, colon, size = text.partition(":")
         if kind == MESH:
             give = re.sub(r"^mesh:(?:.*/)?([^#]*)(#[0-9a-f]*)?", r"mesh:PATH/\1", text)
-            raise UsageError(f"object {text}: only the name of the mesh was stored; give --task.object={give}")
+            raise UsageError(
+                f"object {text}: only the name of the mesh was stored; give --task.object={give}"
+            )
         if kind not in _SIZES:
             raise UnknownName("shape", kind, (*_SIZES, "mesh:FILE"))
         try:
             numbers = [float(number) for number in size.split("x")] if colon else [DEFAULT_WIDTH]
             return cls(kind, _lengths(kind, *numbers))
         except (ValueError, TypeError):
-            raise UsageError(f"object is {shorten(text)}; expected {kind}:{_SIZES[kind]} [m]") from None
+            raise UsageError(
+                f"object is {shorten(text)}; expected {kind}:{_SIZES[kind]} [m]"
+            ) from None
 
     @classmethod
     def of_width(cls, kind: str, width: float) -> ObjectShape:
-        """Return a cube, a sphere, a cylinder as long as wide, or a capsule 1.5 times as long; raises `UsageError`."""
+        """Return a cube, a sphere, a cylinder as long as wide, or a capsule 1.5 times as long.
+
+        Raises `UsageError`.
+        """
         return cls(kind, _lengths(kind, width))
 
     def __str__(self) -> str:
@@ -120,7 +137,11 @@ class ObjectShape:
             return max(LIGHTEST, DENSITY * self.mesh.volume)
         width, depth, length = self.lengths
         disc, ball = math.pi / 4 * width**2, math.pi / 6 * width**3
-        volumes = {"cylinder": disc * length, "sphere": ball, "capsule": disc * (length - width) + ball}
+        volumes = {
+            "cylinder": disc * length,
+            "sphere": ball,
+            "capsule": disc * (length - width) + ball,
+        }
         return max(LIGHTEST, DENSITY * volumes.get(self.kind, width * depth * length))
 
     @property
@@ -132,7 +153,8 @@ class ObjectShape:
 
     @property
     def sizes(self) -> tuple[float, float] | None:
-        """Range of `2 * max(size)` [m] in which the object, scaled as a whole, can be grasped however it lies.
+        """Range of `2 * max(size)` [m] in which the object, scaled as a whole, can be grasped
+        however it lies.
 
         None if that range is empty.
         """
@@ -143,8 +165,13 @@ class ObjectShape:
         return (low, high) if low < high else None
 
 
-def _lengths(kind: str, first: float, second: float | None = None, *rest: float) -> tuple[float, float, float]:
-    """Lengths along the axes of a shape, from the numbers given; raises `TypeError` for a wrong count."""
+def _lengths(
+    kind: str, first: float, second: float | None = None, *rest: float
+) -> tuple[float, float, float]:
+    """Lengths along the axes of a shape, from the numbers given.
+
+    Raises `TypeError` for a wrong count.
+    """
     if kind == "box" and (second is None) != (len(rest) == 1):
         return first, first if second is None else second, rest[0] if rest else first
     if rest or (second is not None and kind in ("box", "sphere", ANY)):
@@ -154,16 +181,21 @@ def _lengths(kind: str, first: float, second: float | None = None, *rest: float)
 
 
 def draws_shape(text: NameOrPath) -> bool:
-    """Return whether `text`, as in `ObjectShape.parse`, asks for a shape that is drawn anew in each episode."""
+    """Return whether `text`, as in `ObjectShape.parse`, asks for a shape that is drawn anew in
+    each episode.
+    """
     return str(text).partition(":")[0] == ANY
 
 
 def stored(text: NameOrPath) -> str:
-    """Return an object's text as datasets store it: for a mesh, with the file's name and hash in place of its path."""
+    """Return an object's text as datasets store it: for a mesh, with the file's name and hash in
+    place of its path.
+    """
     return str(ObjectShape.parse(text)) if isinstance(text, Path) else text
 
 
-ROLLING = 0.005  # rolling friction of round objects, as on a cloth: dropped ones stay within reach [m]
+# rolling friction of round objects, as on a cloth: dropped ones stay within reach [m]
+ROLLING = 0.005
 ROLLING_MESH = 0.001  # rolling friction of a mesh, which with more would balance on an edge [m]
 
 
@@ -174,5 +206,6 @@ def contact(kind: str) -> tuple[int, float]:
     return (4, 0.0001) if kind in ("box", ANY) else (6, ROLLING)
 
 
-_THINNEST, _WIDEST = 0.02, 0.07  # bounds on a scaled object: least length, greatest width between fingers [m]
+# bounds on a scaled object: least length, greatest width between fingers [m]
+_THINNEST, _WIDEST = 0.02, 0.07
 CUBE = ObjectShape("box", (DEFAULT_WIDTH, DEFAULT_WIDTH, DEFAULT_WIDTH))

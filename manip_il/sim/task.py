@@ -29,7 +29,8 @@ class Target(NamedTuple):
         opening: Of the fingers [m].
         max_step: How far a single step may aim towards the position [m].
         max_turn: How far a single step may aim towards the rotation [rad].
-        exact: For tight fits: keep the posture cost of inverse kinematics from pulling the hand a millimetre off.
+        exact: For tight fits: keep the posture cost of inverse kinematics from pulling the hand a
+            millimetre off.
         lean: How far the hand may lean from `rotation` to reach `position`, 0 to 1.
     """
 
@@ -69,27 +70,34 @@ class Start:
     def __post_init__(self) -> None:
         for name, pose in self.poses.items():
             if [np.size(part) for part in pose] != [3, 4]:
-                raise UsageError(f"Start: {name} has {shorten(pose)}; expected (position (3,), quaternion wxyz (4,))")
+                raise UsageError(
+                    f"Start: {name} has {shorten(pose)}; expected (position (3,), quaternion wxyz"
+                    " (4,))"
+                )
 
 
 class Task(ABC):
-    """A task, independent of the arm; a subclass sets the first three attributes and defines the abstract methods.
+    """A task, independent of the arm.
+
+    A subclass sets the first three attributes and defines the abstract methods.
 
     Each rung depends only on the world, so that the expert can label any state.
 
     Attributes:
         name: The task's name in options.
         instruction: Text for policies that read language.
-        rungs: The phases, latest first; the expert takes the first that holds, and the last always holds.
+        rungs: The phases, latest first; the expert takes the first that holds, and the last always
+            holds.
         tolerance: Greatest `error` at which the task is solved [m].
         success_steps: Steps in a row for which it must be solved, at 20 control steps a second.
         horizon: Most control steps of an episode, at 20 a second.
         objects: What the arm moves and must reach; events move the first.
         grasped: Objects that the gripper must go around.
-        sizes: Range of an object's longest edge that the task can take [m]; None if it takes only its own object.
+        sizes: Range of an object's longest edge that the task can take [m]; None if it takes only
+            its own object.
         shape: The object's, in a task that takes any.
-        argument_bodies: Mocap bodies whose places hold the argument of `with_argument`; they stay when other places in
-            a scene are drawn anew.
+        argument_bodies: Mocap bodies whose places hold the argument of `with_argument`; they stay
+            when other places in a scene are drawn anew.
     """
 
     name: str
@@ -114,7 +122,9 @@ class Task(ABC):
 
     @abstractmethod
     def observe(self, world: World) -> Observed:
-        """Return the entries of `environment_state` by name, in its order: numbers, and vectors of x, y and z."""
+        """Return the entries of `environment_state` by name, in its order: numbers, and vectors
+        of x, y and z.
+        """
 
     @abstractmethod
     def error(self, world: World) -> float:
@@ -122,18 +132,27 @@ class Task(ABC):
 
     @abstractmethod
     def progress(self, world: World) -> float:
-        """Return how much of the task is done, 0 to 1; this never falls while the task is done correctly."""
+        """Return how much of the task is done, 0 to 1.
+
+        This never falls while the task is done correctly.
+        """
 
     def objects_in(self, world: World) -> tuple[str, ...]:
         """Return the objects that the arm must reach in the world's present episode."""
         return self.objects
 
     def instruction_in(self, world: World) -> str:
-        """Return the text of the world's present episode; if it varies, a mocap body's pose must encode it."""
+        """Return the text of the world's present episode.
+
+        If it varies, a mocap body's pose must encode it.
+        """
         return self.instruction
 
     def unsound(self, world: World) -> str:
-        """Return why, even with the objects within reach, there is no sound label; empty if there is one."""
+        """Return why, even with the objects within reach, there is no sound label.
+
+        Empty if there is one.
+        """
         return ""
 
     def fitted(self, robot: Robot) -> Task:
@@ -141,16 +160,28 @@ class Task(ABC):
         return self
 
     def with_shape(self, shape: ObjectShape) -> Self:
-        """Return this task with an object of another shape. Raises `UsageError` if it takes none."""
-        raise UsageError(f"object is {shape}, but the objects of {self.name} are fixed; omit --task.object")
+        """Return this task with an object of another shape.
+
+        Raises `UsageError` if it takes none.
+        """
+        raise UsageError(
+            f"object is {shape}, but the objects of {self.name} are fixed; omit --task.object"
+        )
 
     def with_argument(self, text: NameOrPath) -> Self:
-        """Return the variant `NAME:ARGUMENT`, whose `name` holds the argument. Raises `UsageError` if it takes none."""
-        raise UsageError(f"task is {self.name}:{text}, but {self.name} takes no argument after a colon")
+        """Return the variant `NAME:ARGUMENT`, whose `name` holds the argument.
+
+        Raises `UsageError` if it takes none.
+        """
+        raise UsageError(
+            f"task is {self.name}:{text}, but {self.name} takes no argument after a colon"
+        )
 
 
 def phases(task: Task) -> tuple[str, ...]:
-    """Return the names of a task's phases, in the order of `expert_phase`: `none`, then the rungs, earliest first."""
+    """Return the names of a task's phases, in the order of `expert_phase`: `none`, then the
+    rungs, earliest first.
+    """
     return (NO_PHASE, *(rung.name for rung in reversed(task.rungs)))
 
 

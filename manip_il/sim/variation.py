@@ -1,7 +1,8 @@
 """How a world differs from the compiled model, as numbers that a state holds.
 
-First five numbers per object: MuJoCo's `geom_size` (3,) [m], the mass [kg] and the sliding friction. Then the numbers
-of the world as a whole, such as `table` and `clutter`, with the names and units of `Condition`.
+First five numbers per object: MuJoCo's `geom_size` (3,) [m], the mass [kg] and the sliding
+friction. Then the numbers of the world as a whole, such as `table` and `clutter`, with the names
+and units of `Condition`.
 """
 
 from collections.abc import Mapping
@@ -33,7 +34,8 @@ WORLD_SIZE = 1 + sum(len(quantity.places) for quantity in RANGES.values())
 NOTHING_DRAWN = np.full(WORLD_SIZE, OWN)  # the world's numbers, (w,)
 for _quantity in RANGES.values():
     NOTHING_DRAWN[_quantity.places] = _quantity.nominal
-_NOT_PHYSICS = WORLD_SIZE - RANGES["posture"].places[0]  # numbers for how the episode began and how it looks
+# numbers for how the episode began and how it looks
+_NOT_PHYSICS = WORLD_SIZE - RANGES["posture"].places[0]
 
 
 @dataclass(frozen=True)
@@ -60,12 +62,16 @@ def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
 
 
 def part(variation: F64, name: str) -> F64:
-    """Return the numbers of one quantity of `RANGES`, such as `table` or `clutter`, in a variation (v,)."""
+    """Return the numbers of one quantity of `RANGES`, such as `table` or `clutter`, in a
+    variation (v,).
+    """
     return _world(variation)[RANGES[name].places]
 
 
 def seen_objects(variation: F64) -> tuple[F64, int | None]:
-    """Return `geom_size` of all objects, (o, 3) [m], and their MuJoCo geom type, None unless a shape was drawn."""
+    """Return `geom_size` of all objects, (o, 3) [m], and their MuJoCo geom type, None unless a
+    shape was drawn.
+    """
     shape = float(_world(variation)[_SHAPE])
     return _objects(variation)[:, _SIZE], None if shape == OWN else int(shape)
 
@@ -84,10 +90,12 @@ def same_physics(variation: F64, other: F64) -> bool:
 
 
 def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
-    """Return `base` (v,) with the values in `drawn`, whose names and units are those of `Condition`.
+    """Return `base` (v,) with the values in `drawn`, whose names and units are those of
+    `Condition`.
 
-    Names of other quantities change nothing. size is the edge or width [m]. An object of a drawn shape has the mass of
-    a wooden one, unless a mass is drawn. camera_shift and camera_turn have a vector (3,) per camera.
+    Names of other quantities change nothing. size is the edge or width [m]. An object of a drawn
+    shape has the mass of a wooden one, unless a mass is drawn. camera_shift and camera_turn have a
+    vector (3,) per camera.
     """
     varied = base.copy()
     rows, world = _objects(varied), _world(varied)
@@ -119,8 +127,8 @@ def apply(
 ) -> None:
     """Apply `variation` (v,) to the objects and the arm of a model that is not shared.
 
-    plain: the model as compiled. motors: actuators of the arm's joints, (arm,). Call `mj_setConst` afterwards: it
-    updates what depends on masses.
+    plain: the model as compiled. motors: actuators of the arm's joints, (arm,). Call `mj_setConst`
+    afterwards: it updates what depends on masses.
     """
     # kv changes by the square root of kp's factor, which keeps the damping ratio.
     damping, gain = part(variation, "joint_damping"), part(variation, "actuator_gain")
@@ -138,7 +146,10 @@ def _apply_object(changed: Any, plain: Any, one: Object, row: F64, shape: int | 
     geom, body = one.geom, one.body
     size, mass, friction = row[_SIZE], row[_MASS], row[_FRICTION]
     kind = own = int(plain.geom_type[geom])
-    changed.geom_condim[geom], changed.geom_friction[geom] = plain.geom_condim[geom], plain.geom_friction[geom]
+    changed.geom_condim[geom], changed.geom_friction[geom] = (
+        plain.geom_condim[geom],
+        plain.geom_friction[geom],
+    )
     if shape is not None:
         kind = shape
         changed.geom_condim[geom], changed.geom_friction[geom, 2] = contact(KINDS[shape])
@@ -156,6 +167,9 @@ def _apply_object(changed: Any, plain: Any, one: Object, row: F64, shape: int | 
         getattr(changed, name)[geom] = getattr(like, name)[at]
     changed.bvh_aabb[nodes, 3:] = bounds
     changed.body_mass[body], changed.body_inertia[body] = mass, inertia
-    # MuJoCo uses the larger friction of two touching geoms unless one has priority; a drawn friction gets it.
+    # MuJoCo uses the larger friction of two touching geoms unless one has priority; a drawn
+    # friction gets it.
     changed.geom_friction[geom, 0] = friction
-    changed.geom_priority[geom] = plain.geom_priority[geom] or friction != plain.geom_friction[geom, 0]
+    changed.geom_priority[geom] = (
+        plain.geom_priority[geom] or friction != plain.geom_friction[geom, 0]
+    )

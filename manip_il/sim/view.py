@@ -1,8 +1,10 @@
-"""The model that pictures are drawn from: a copy of the physics model with few faces, lit by a `Look`.
+"""The model that pictures are drawn from: a copy of the physics model with few faces, lit by a
+`Look`.
 
 One episode's drawn values are applied to it and undone for the next.
 
-Software rendering costs time per triangle, and the Panda's meshes have 136,040 for an arm that is 60 pixels tall.
+Software rendering costs time per triangle, and the Panda's meshes have 136,040 for an arm that is
+60 pixels tall.
 """
 
 import copy
@@ -24,11 +26,16 @@ from manip_il.sim.world import SCENES_KEPT, Scene
 
 Indices = NDArray[np.integer]
 _CELLS = 22  # grid cells along a mesh's diagonal: enough to look right at 480 x 640 pixels
-_LEAST_CELL = 0.008  # least width of a cell: a pixel at 128 x 128; less if the cameras are nearer [m]
+# least width of a cell: a pixel at 128 x 128; less if the cameras are nearer [m]
+_LEAST_CELL = 0.008
 _PLAIN_FACES = 1_600  # meshes with up to this many faces are not simplified
 _PULL = 0.01  # weight of a cell's mean, relative to its faces' planes, in placing its vertex
 _LEAST_PULL = 1e-12  # [m^2] if a cell has no faces
-_LAMPS = tuple(lamp + colour for lamp in ("light_", "vis.headlight.") for colour in ("ambient", "diffuse", "specular"))
+_LAMPS = tuple(
+    lamp + colour
+    for lamp in ("light_", "vis.headlight.")
+    for colour in ("ambient", "diffuse", "specular")
+)
 _CHANGED = (
     "geom_type",
     "geom_size",
@@ -43,7 +50,8 @@ _CHANGED = (
 
 
 class ViewModel:
-    """A model to draw from, not to simulate: every name, address and pose in `model` is the physics model's.
+    """A model to draw from, not to simulate: every name, address and pose in `model` is the physics
+    model's.
 
     fine: keep every face of the meshes.
     """
@@ -60,7 +68,9 @@ class ViewModel:
         self._applied = scene.nominal
 
     def apply(self, variation: F64) -> None:
-        """Apply the look of a variation (v,) to the next pictures, without uploading anything to the graphics card."""
+        """Apply the look of a variation (v,) to the next pictures, without uploading anything to
+        the graphics card.
+        """
         if np.array_equal(variation, self._applied):
             return
         for name, plain in self._plain.items():
@@ -71,10 +81,14 @@ class ViewModel:
             self.model.geom_type[self._objects] = kind
         self._paint(self._objects, part(variation, "colour"))
         self._paint(self._table, part(variation, "table"))
-        shifts, turns = (part(variation, name).reshape(-1, 3) for name in ("camera_shift", "camera_turn"))
+        shifts, turns = (
+            part(variation, name).reshape(-1, 3) for name in ("camera_shift", "camera_turn")
+        )
         for moved in zip(CAMERAS, shifts, turns, strict=True):
             self._move_camera(*moved)
-        self._light(float(part(variation, "brightness")[0]), float(part(variation, "light_turn")[0]))
+        self._light(
+            float(part(variation, "brightness")[0]), float(part(variation, "light_turn")[0])
+        )
         self._applied = variation.copy()
 
     def _paint(self, geoms: Sequence[int], colour: F64) -> None:
@@ -91,7 +105,9 @@ class ViewModel:
         mujoco.mju_quatIntegrate(quat, np.deg2rad(turn), 1.0)
 
     def _light(self, brightness: float, light_turn: float) -> None:
-        """Multiply every lamp by a factor, and turn those fixed in the world about the vertical [deg]."""
+        """Multiply every lamp by a factor, and turn those fixed in the world about the vertical
+        [deg].
+        """
         for name in _LAMPS:
             attrgetter(name)(self.model)[:] *= brightness
         rotation = turn_about_z(np.deg2rad(light_turn))
@@ -108,14 +124,19 @@ def _with_few_faces(scene: Scene) -> mujoco.MjModel:
 
 
 def simplify_meshes(model: mujoco.MjModel, finest: float) -> None:
-    """Reduce the faces of large meshes in a model that is only drawn. finest: least size of a grid cell [m]."""
+    """Reduce the faces of large meshes in a model that is only drawn. finest: least size of a
+    grid cell [m].
+    """
     for mesh in range(model.nmesh):
         if model.mesh_facenum[mesh] > _PLAIN_FACES:
             _simplify(model, mesh, finest)
 
 
 def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
-    """Overwrite the start of a mesh's vertices, normals and faces with fewer; the rest is never drawn."""
+    """Overwrite the start of a mesh's vertices, normals and faces with fewer.
+
+    The rest is never drawn.
+    """
     vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
     normals = model.mesh_normal[model.mesh_normaladr[mesh] :][: model.mesh_normalnum[mesh]]
     faces, face_normals = (
@@ -130,11 +151,15 @@ def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
     model.mesh_facenum[mesh] = len(few)
 
 
-def cluster(vertices: F64, faces: Indices, finest: float = _LEAST_CELL) -> tuple[F64, Indices, Indices]:
-    """Merge vertices (v, 3) that share a grid cell; return positions (c, 3), indices of originals (c,), faces (f, 3).
+def cluster(
+    vertices: F64, faces: Indices, finest: float = _LEAST_CELL
+) -> tuple[F64, Indices, Indices]:
+    """Merge vertices (v, 3) that share a grid cell.
 
-    finest: least size of a cell [m]. The original of a cell is the vertex nearest to the mean of its vertices; the
-    original's normal shades the coarse mesh like the fine one.
+    Return positions (c, 3), indices of originals (c,), faces (f, 3).
+
+    finest: least size of a cell [m]. The original of a cell is the vertex nearest to the mean of
+    its vertices; the original's normal shades the coarse mesh like the fine one.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = max(float(np.linalg.norm(high - low)) / _CELLS, finest)
@@ -142,14 +167,16 @@ def cluster(vertices: F64, faces: Indices, finest: float = _LEAST_CELL) -> tuple
     _, cell, counts = np.unique(grid, axis=0, return_inverse=True, return_counts=True)
     means = _sums(cell, vertices, len(counts)) / counts[:, None]
     moves = _flattest(vertices, faces, cell, means) - means
-    moves *= size / np.maximum(np.linalg.norm(moves, axis=1, keepdims=True), size)  # by a cell's size at most
+    # by a cell's size at most
+    moves *= size / np.maximum(np.linalg.norm(moves, axis=1, keepdims=True), size)
     by_distance = np.lexsort([np.linalg.norm(vertices - means[cell], axis=1), cell])
     originals = by_distance[np.cumsum(counts) - counts]
     return means + moves, originals, _distinct(cell[faces])
 
 
 def _flattest(vertices: F64, faces: Indices, cell: Indices, means: F64) -> F64:
-    """Points with least squared distances to the planes of a cell's faces, weighted by area: sharp edges stay.
+    """Points with least squared distances to the planes of a cell's faces, weighted by area: sharp
+    edges stay.
 
     After P. Lindstrom, Out-of-core simplification of large polygonal models (2000).
     """
@@ -164,7 +191,9 @@ def _flattest(vertices: F64, faces: Indices, cell: Indices, means: F64) -> F64:
     matrix = _sums(corners, matrices[face], len(means)).reshape(-1, 3, 3)
     right = _sums(corners, rights[face], len(means))
     pull = _PULL * np.trace(matrix, axis1=1, axis2=2)[:, None] + _LEAST_PULL
-    return np.linalg.solve(matrix + pull[:, :, None] * np.eye(3), (right + pull * means)[:, :, None])[:, :, 0]
+    return np.linalg.solve(
+        matrix + pull[:, :, None] * np.eye(3), (right + pull * means)[:, :, None]
+    )[:, :, 0]
 
 
 def _distinct(faces: Indices) -> Indices:

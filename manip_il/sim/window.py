@@ -1,7 +1,7 @@
 """MuJoCo's own viewer of an environment, in real time, if there is a display.
 
-It shows a copy of the model and of the physics: changes in its panels do not affect the episode, except that callers
-can use the control sliders (`commands`) and the pull of the mouse (`pull`).
+It shows a copy of the model and of the physics: changes in its panels do not affect the episode,
+except that callers can use the control sliders (`commands`) and the pull of the mouse (`pull`).
 """
 
 import atexit
@@ -36,14 +36,18 @@ def has_display() -> bool:
 
 
 def require_display() -> None:
-    """Raise `RenderError` if no window can be opened: MuJoCo's viewer would end the process, or wait forever."""
+    """Raise `RenderError` if no window can be opened: MuJoCo's viewer would end the process, or
+    wait forever.
+    """
     import glfw  # MuJoCo's own
 
     with warnings.catch_warnings(action="ignore"):  # glfw warns if there is no display
         opened = has_display() and glfw.init()
     if not opened:
         named = ", ".join(f"{name}={os.environ.get(name, '')}" for name in DISPLAYS)
-        raise RenderError(f'no display: {named}; use render_mode="rgb_array", or manip-il view --output=FILE.rrd')
+        raise RenderError(
+            f'no display: {named}; use render_mode="rgb_array", or manip-il view --output=FILE.rrd'
+        )
 
 
 class Clock:
@@ -53,7 +57,10 @@ class Clock:
         self._step, self._due = 1 / hz, 0.0
 
     def wait(self) -> None:
-        """Wait until a control step has passed since the last call returned; return at once if it already has."""
+        """Wait until a control step has passed since the last call returned.
+
+        Return at once if it already has.
+        """
         now = time.monotonic()
         self._due = max(self._due + self._step, now)
         time.sleep(self._due - now)
@@ -62,7 +69,8 @@ class Clock:
 class Window:
     """A window that shows a scene, `control_hz` times a second.
 
-    sliders: open the right panel, which has the control sliders. Raises `RenderError` if there is no display.
+    sliders: open the right panel, which has the control sliders. Raises `RenderError` if there is
+    no display.
     """
 
     def __init__(self, scene: Scene, control_hz: float, *, sliders: bool = False):
@@ -78,7 +86,8 @@ class Window:
             self._model, self._data, show_left_ui=False, show_right_ui=sliders
         )
         self._threads = [one for one in threading.enumerate() if one not in others]
-        atexit.register(self.close)  # before MuJoCo's own handlers, which do not wait for its threads and may crash
+        # before MuJoCo's own handlers, which do not wait for its threads and may crash
+        atexit.register(self.close)
         with self._handle.lock():
             camera = self._handle.cam
             camera.lookat[:] = [*scene.robot.workspace.centre, _LOOK_AT]
@@ -92,7 +101,9 @@ class Window:
         return self._handle.is_running()
 
     def show(self, data: mujoco.MjData, variation: F64, text: str = "") -> None:
-        """Show `data` in the look of `variation` (v,), then wait for real time. text: shown in the upper left."""
+        """Show `data` in the look of `variation` (v,), then wait for real time. text: shown in
+        the upper left.
+        """
         if not self.is_open:
             return
         with self._handle.lock():
@@ -108,7 +119,9 @@ class Window:
 
     @property
     def commands(self) -> F64:
-        """Positions of the control sliders, in the actuators' units, (u,): as shown last, or as moved since."""
+        """Positions of the control sliders, in the actuators' units, (u,): as shown last, or as
+        moved since.
+        """
         return self._data.ctrl.copy()
 
     def pull(self, data: mujoco.MjData) -> None:

@@ -1,6 +1,7 @@
 """A compiled scene and its present physics, which tasks and the expert read by name.
 
-Lengths in [m], angles in [rad], all in the world's frame: z = 0 is the table's top, x points away from the robot.
+Lengths in [m], angles in [rad], all in the world's frame: z = 0 is the table's top, x points away
+from the robot.
 """
 
 import copy
@@ -26,10 +27,12 @@ from manip_il.sim.shape import ANY
 from manip_il.sim.variation import Object
 
 STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_BESIDE, _NEAR = (-0.02, 0.07), 0.08  # heights and distance at which a hand may hit a neighbour of an object [m]
+# heights and distance at which a hand may hit a neighbour of an object [m]
+_BESIDE, _NEAR = (-0.02, 0.07), 0.08
 _MOST_TURNS = 4  # symmetric turns tried in each direction
 _AT_REST = 0.03, 0.5  # speeds below which an object is at rest [m/s], [rad/s]
-SCENES_KEPT = 4  # scenes cached per process, and what is computed from one: the finest meshes take 64 MB
+# scenes cached per process, and what is computed from one: the finest meshes take 64 MB
+SCENES_KEPT = 4
 USUAL = 0.15  # half width of Panda's workspace [m]
 GOAL = "goal"  # the mocap body that marks the goal
 
@@ -45,9 +48,9 @@ class Pose(NamedTuple):
 class Scene:
     """A robot and a task's objects as one compiled model, and the addresses of its named parts.
 
-    task: the `Task`. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free bodies by name.
-    hulls: convex hulls, by name, of the objects that are meshes.
-    ee_site, shoulder: ids of the site `ee` and of the arm's first joint. yaws: least and greatest yaw of the hand,
+    task: the `Task`. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free
+    bodies by name. hulls: convex hulls, by name, of the objects that are meshes. ee_site, shoulder:
+    ids of the site `ee` and of the arm's first joint. yaws: least and greatest yaw of the hand,
     relative to `World.ahead` [rad]. nominal: the variation of the model as compiled, (v,).
     """
 
@@ -82,8 +85,12 @@ class Scene:
 
     @cached_property
     def furniture(self) -> I64:
-        """The numbers of the geoms of mocap bodies, (g,): goal markers and the fixed parts of the task."""
-        return np.flatnonzero(self.model.body_mocapid[self.model.body_rootid[self.model.geom_bodyid]] >= 0)
+        """The numbers of the geoms of mocap bodies, (g,): goal markers and the fixed parts of
+        the task.
+        """
+        return np.flatnonzero(
+            self.model.body_mocapid[self.model.body_rootid[self.model.geom_bodyid]] >= 0
+        )
 
     @property
     def name(self) -> str:
@@ -94,9 +101,9 @@ class Scene:
 class World:
     """One scene's physics, and what can be read from it by name.
 
-    model, data: replaced as the variation changes; the model is the scene's shared one or this world's own copy.
-    ee: the frame between the fingertips, z out of the hand, y along the fingers' motion. Poses need up-to-date
-    kinematics (`update`).
+    model, data: replaced as the variation changes; the model is the scene's shared one or this
+    world's own copy. ee: the frame between the fingertips, z out of the hand, y along the fingers'
+    motion. Poses need up-to-date kinematics (`update`).
     """
 
     def __init__(self, scene: Scene):
@@ -112,17 +119,26 @@ class World:
     def _use(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self.model, self.data = model, data
         at, self._poses = self.scene.ee_site, dict[str, Pose]()
-        self.ee = Pose(data.site_xpos[at], data.site_xmat[at].reshape(3, 3))  # a view that follows the world
+        # a view that follows the world
+        self.ee = Pose(data.site_xpos[at], data.site_xmat[at].reshape(3, 3))
 
     def __reduce__(self) -> NoReturn:
-        raise ManipError("an environment cannot be copied or pickled; make a new one and restore get_state() there")
+        raise ManipError(
+            "an environment cannot be copied or pickled; make a new one and restore get_state()"
+            " there"
+        )
 
     # Physics
 
     def vary(self, variation: F64) -> None:
-        """Apply the physics of `variation` (v,) to the model. Raises `MismatchError` for one of another length."""
+        """Apply the physics of `variation` (v,) to the model.
+
+        Raises `MismatchError` for one of another length.
+        """
         if len(variation) != (size := len(self.scene.nominal)):
-            raise MismatchError("size of the variation", "the state", len(variation), "the scene", size)
+            raise MismatchError(
+                "size of the variation", "the state", len(variation), "the scene", size
+            )
         if variation.tobytes() == self.variation.tobytes():
             return
         self._cache.clear()
@@ -134,7 +150,9 @@ class World:
             model = copy.copy(self.scene.model)  # with its own masses and sizes
             self._own = model, mujoco.MjData(model)
         self._use(*self._own)
-        variations.apply(self.model, self.scene.model, self.scene.objects, self.scene.arm_ctrl, variation)
+        variations.apply(
+            self.model, self.scene.model, self.scene.objects, self.scene.arm_ctrl, variation
+        )
         mujoco.mj_setConst(self.model, self.data)  # updates what depends on masses
 
     def physics(self) -> F64:
@@ -144,10 +162,15 @@ class World:
         return physics
 
     def restore(self, physics: F64, variation: F64) -> None:
-        """Restore physics (p,) and variation (v,), bit for bit. Raises `MismatchError` for those of another scene."""
+        """Restore physics (p,) and variation (v,), bit for bit.
+
+        Raises `MismatchError` for those of another scene.
+        """
         size = self.scene.state_size
         if len(physics) != size:
-            raise MismatchError("size of the physics state", "the state", len(physics), self.scene.name, size)
+            raise MismatchError(
+                "size of the physics state", "the state", len(physics), self.scene.name, size
+            )
         self.vary(variation)
         mujoco.mj_setState(self.model, self.data, physics, STATE_KIND)
         self.update()
@@ -158,7 +181,10 @@ class World:
         mujoco.mj_kinematics(self.model, self.data)
 
     def place(self, name: str, position: F64, quaternion: F64) -> None:
-        """Place an object (at rest) or mocap body: position (3,) [m], quaternion wxyz (4,). Call `update` next."""
+        """Place an object (at rest) or mocap body: position (3,) [m], quaternion wxyz (4,).
+
+        Call `update` next.
+        """
         if name in self.scene.objects:
             placed = self.scene.objects[name]
             self.data.qpos[placed.q : placed.q + 7] = [*position, *quaternion]
@@ -182,7 +208,9 @@ class World:
         pose = self._poses.get(name)
         if pose is None:
             body = self._body(name).id
-            pose = self._poses[name] = Pose(self.data.xpos[body], self.data.xmat[body].reshape(3, 3))
+            pose = self._poses[name] = Pose(
+                self.data.xpos[body], self.data.xmat[body].reshape(3, 3)
+            )
         return pose
 
     def at(self, name: str) -> F64:
@@ -209,14 +237,19 @@ class World:
         return yaw_ahead(self.robot, self.data.xanchor[self.scene.shoulder], position)
 
     def turns(self, yaw: float, alike: float, position: F64) -> list[float]:
-        """Return the yaws relative to `ahead` [rad] that bring a hand at a position (3,) [m] to `yaw` or an equivalent.
+        """Return the yaws relative to `ahead` [rad] that bring a hand at a position (3,) [m] to
+        `yaw` or an equivalent.
 
-        alike: turn after which the grasp looks the same [rad]. If none is in the arm's range, return the one nearest to
-        `ahead`.
+        alike: turn after which the grasp looks the same [rad]. If none is in the arm's range,
+        return the one nearest to `ahead`.
         """
         low, high = self.scene.yaws
         off = math.remainder(yaw - self.ahead(position), alike)
-        ways = [off + turn * alike for turn in range(-_MOST_TURNS, _MOST_TURNS + 1)] if math.isfinite(low) else [off]
+        ways = (
+            [off + turn * alike for turn in range(-_MOST_TURNS, _MOST_TURNS + 1)]
+            if math.isfinite(low)
+            else [off]
+        )
         return [way for way in ways if low <= way <= high] or [off]
 
     def turned(self, position: F64) -> float:
@@ -232,16 +265,24 @@ class World:
         return angle_across(hand) if self.robot.leans else angle_ahead(hand)
 
     def off_down(self, yaw: float) -> float:
-        """Return the angle [rad] between the hand and `hand_down(yaw)`; for an arm that leans, in yaw only."""
+        """Return the angle [rad] between the hand and `hand_down(yaw)`.
+
+        For an arm that leans, in yaw only.
+        """
         hand = self.ee.rotation
         return off_yaw(hand, yaw) if self.robot.leans else angle_from_down(hand, yaw)
 
     def extents(self, name: str) -> tuple[float, ...]:
-        """Return an object's lengths along its own x, y and z [m]; for a mesh, those of a box centred on its origin."""
+        """Return an object's lengths along its own x, y and z [m].
+
+        For a mesh, those of a box centred on its origin.
+        """
         hull, geom = self.hull(name), self.scene.objects[name].geom
         if hull is not None:
             return hull.extents
-        return self.remember(("extents", name), lambda: tuple((2 * self.model.geom_aabb[geom, 3:]).tolist()))
+        return self.remember(
+            ("extents", name), lambda: tuple((2 * self.model.geom_aabb[geom, 3:]).tolist())
+        )
 
     def kind(self, name: str) -> int:
         """Return MuJoCo's geom type of an object."""
@@ -260,21 +301,30 @@ class World:
     def touched(self, name: str) -> bool:
         """Return whether every finger touches an object."""
         geom = self.scene.objects[name].geom
-        return self.remember(("touched", name), lambda: self.gripper.touches(self.model, self.data, geom))
+        return self.remember(
+            ("touched", name), lambda: self.gripper.touches(self.model, self.data, geom)
+        )
 
     def neighbours(self, name: str) -> list[tuple[float, float]]:
-        """Return the offsets (x, y) [m] from an object's centre to the nearest point of each neighbour within 8 cm.
+        """Return the offsets (x, y) [m] from an object's centre to the nearest point of each
+        neighbour within 8 cm.
 
-        Neighbours are furniture and other objects that a hand over the object could hit, taken as axis-aligned boxes.
+        Neighbours are furniture and other objects that a hand over the object could hit, taken as
+        axis-aligned boxes.
         """
         others = self._standing[name]
         if not len(others):
             return []
         at, half = self.pose(name).position, self.model.geom_size[others]
         away = self.data.geom_xpos[others] - at
-        nearest = away - np.minimum(np.maximum(away, -half), half)  # 0 along an axis on which they overlap
+        # 0 along an axis on which they overlap
+        nearest = away - np.minimum(np.maximum(away, -half), half)
         low, high = _BESIDE
-        return [(x, y) for x, y, z in nearest.tolist() if low < z < high and 0 < math.hypot(x, y) < _NEAR]
+        return [
+            (x, y)
+            for x, y, z in nearest.tolist()
+            if low < z < high and 0 < math.hypot(x, y) < _NEAR
+        ]
 
     @cached_property
     def _standing(self) -> Mapping[str, I64]:
@@ -282,7 +332,11 @@ class World:
         objects, furniture = self.scene.objects, self.scene.furniture
         furniture = furniture[self.scene.model.geom_contype[furniture] > 0]
         return {
-            name: np.append(furniture, [objects[other].geom for other in objects if other != name]).astype(np.int64)
+            name: (
+                np.append(
+                    furniture, [objects[other].geom for other in objects if other != name]
+                ).astype(np.int64)
+            )
             for name in objects
         }
 

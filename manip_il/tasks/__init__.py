@@ -1,7 +1,9 @@
-"""Tasks, one file each, and their names for gymnasium: `manip_il/PandaPickPlace-v0` and its siblings.
+"""Tasks, one file each, and their names for gymnasium: `manip_il/PandaPickPlace-v0` and its
+siblings.
 
-`manip_il/PickPlace-v0` takes the robot as an argument, `manip_il/Task-v0` robot and task, each as a name or file path.
-`NAMES` lists the tasks of `table.py`, in its order; help reads it without importing the simulator.
+`manip_il/PickPlace-v0` takes the robot as an argument, `manip_il/Task-v0` robot and task, each as a
+name or file path. `NAMES` lists the tasks of `table.py`, in its order; help reads it without
+importing the simulator.
 """
 
 import gymnasium
@@ -35,9 +37,14 @@ ANY_ID = "manip_il/Task-v0"  # robot and task are arguments
 
 
 def register_envs() -> None:
-    """Register every robot-task pair, every task and `ANY_ID` with gymnasium; a second call changes nothing."""
+    """Register every robot-task pair, every task and `ANY_ID` with gymnasium.
+
+    A second call changes nothing.
+    """
     named = {env_id: {"robot": robot, "task": task} for env_id, (robot, task) in ENV_IDS.items()}
     named |= {env_id: {"task": task} for env_id, task in TASK_IDS.items()} | {ANY_ID: {}}
     for env_id, kwargs in named.items():
         if env_id not in gymnasium.registry:
-            gymnasium.register(env_id, entry_point="manip_il.worlds.ladder.world:make_env", kwargs=kwargs)
+            gymnasium.register(
+                env_id, entry_point="manip_il.worlds.ladder.world:make_env", kwargs=kwargs
+            )

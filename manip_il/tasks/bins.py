@@ -15,15 +15,22 @@ from manip_il.tasks.objects import WOOD, add_furniture, add_part
 
 WALL, THIN = 0.05, 0.003  # height of a box, half the thickness of walls and floor [m]
 DROP = 0.02  # height of an object's bottom over a box's floor at release [m]
-OVER_WALL = LiftProfile(most=0.065, slope=2.5, free=0.012, rise_first=0.03, max_step=0.045)  # over a box's wall
+# over a box's wall
+OVER_WALL = LiftProfile(most=0.065, slope=2.5, free=0.012, rise_first=0.03, max_step=0.045)
 OVER = 0.11  # height of the hand over an object on approach [m]
 AWAY = 0.2  # height of the hand over a box once its work there is done [m]
-_AT = (0.035, 0.05)  # offsets within which the hand is still at an object in a box: sideways, above [m]
+# offsets within which the hand is still at an object in a box: sideways, above [m]
+_AT = (0.035, 0.05)
 _RISE = 0.10  # height of the hand over an object after release [m]
 
 
-def add_bin(spec: mujoco.MjSpec, name: str, inside: tuple[float, float], colour: tuple[float, ...] = WOOD) -> None:
-    """Add an open box; its pose is set at the start of an episode. inside: half its inner length and width [m]."""
+def add_bin(
+    spec: mujoco.MjSpec, name: str, inside: tuple[float, float], colour: tuple[float, ...] = WOOD
+) -> None:
+    """Add an open box.
+
+    Its pose is set at the start of an episode. inside: half its inner length and width [m].
+    """
     box, high = add_furniture(spec, name), WALL / 2
     length, width = inside
     x, y = length + THIN, width + THIN
@@ -48,11 +55,17 @@ def nearest_to_hand(world: World, names: Sequence[str]) -> str:
 
 
 def drop_rungs(
-    which: Which, to: Place, is_done: Callable[[World, str], bool], names: Sequence[str], lift: LiftProfile = OVER_WALL
+    which: Which,
+    to: Place,
+    is_done: Callable[[World, str], bool],
+    names: Sequence[str],
+    lift: LiftProfile = OVER_WALL,
 ) -> tuple[Rung, ...]:
-    """Return the rungs that carry the current object to its release point over a box and drop it in.
+    """Return the rungs that carry the current object to its release point over a box and drop it
+    in.
 
-    which: returns the current object; to: where to release its centre [m]; is_done: whether an object is in its box.
+    which: returns the current object; to: where to release its centre [m]; is_done: whether an
+    object is in its box.
     """
 
     def nearest(world: World) -> str:
@@ -75,6 +88,9 @@ def rise_over(world: World, box: str) -> Target:
 
 
 def drop_place(world: World, name: str, box: str, offset: Sequence[float] = (0.0, 0.0)) -> F64:
-    """Return where to release an object over a box, (3,) [m]; offset: from the middle of its floor, (2,) [m]."""
+    """Return where to release an object over a box, (3,) [m].
+
+    offset: from the middle of its floor, (2,) [m].
+    """
     height = 2 * THIN + lie_of(world, name).tall / 2 + DROP
     return world.at(box) + [offset[0], offset[1], height]

@@ -10,7 +10,16 @@ import numpy as np
 from manip_il.mdp import F64
 from manip_il.sim.task import Observed, Rung, Start, Task
 from manip_il.sim.world import World
-from manip_il.tasks.bins import OVER, OVER_WALL, add_bin, drop_place, drop_rungs, is_in, nearest_to_hand, rise_over
+from manip_il.tasks.bins import (
+    OVER,
+    OVER_WALL,
+    add_bin,
+    drop_place,
+    drop_rungs,
+    is_in,
+    nearest_to_hand,
+    rise_over,
+)
 from manip_il.tasks.grasp import once_per_state
 from manip_il.tasks.ladder import carry_progress, grasp_progress, grasp_rungs, is_held
 from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
@@ -23,7 +32,9 @@ BOX = "box"
 INSIDE = (0.075, 0.075)  # half the box's inner length and width [m]
 HALF = 0.018  # half a cube's edge length [m]
 SLOT = 0.032  # offset of a cube's release point from the box's middle, along each side [m]
-SLOTS = {name: (x, y) for name, (y, x) in zip(COLOURS, product((-SLOT, SLOT), repeat=2), strict=True)}
+SLOTS = {
+    name: (x, y) for name, (y, x) in zip(COLOURS, product((-SLOT, SLOT), repeat=2), strict=True)
+}
 SIDE = 0.225  # offset of the box's middle from the workspace's, left or right [m]
 APART = 0.08  # least distance between cubes at the start [m]
 ROOM = 0.03  # reachable margin around a cube at the start [m]
@@ -42,7 +53,10 @@ def _inside(world: World, name: str) -> bool:
 
 @once_per_state
 def current(world: World) -> str:
-    """Return the cube that is in the hand, else the first that is not in the box; the last if all are."""
+    """Return the cube that is in the hand, else the first that is not in the box.
+
+    The last if all are.
+    """
     left = _left(world) or tuple(COLOURS)[-1:]
     nearest = nearest_to_hand(world, left)
     return nearest if is_held(world, nearest) else left[0]
@@ -86,26 +100,37 @@ class ClearTable(Task):
         box = np.array([x + rng.uniform(-0.03, 0.03), y + rng.choice([-1.0, 1.0]) * SIDE, 0.0])
 
         def fits(at: F64, others: Sequence[F64]) -> bool:
-            return abs(at[1] - box[1]) > FROM_BOX and all(math.dist(at, other) > APART for other in others)
+            return abs(at[1] - box[1]) > FROM_BOX and all(
+                math.dist(at, other) > APART for other in others
+            )
 
-        places = draw_together(lambda name: draw_resting(rng, world, name, ROOM), COLOURS, fits, world)
+        places = draw_together(
+            lambda name: draw_resting(rng, world, name, ROOM), COLOURS, fits, world
+        )
         cubes = {name: (at, draw_yaw(rng)) for name, at in zip(COLOURS, places, strict=True)}
         return Start({BOX: (box, UPRIGHT), **cubes})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, box, next cube, the vector to its place, each cube's position, and whether it is in the box."""
+        """Return hand, box, next cube, the vector to its place, each cube's position, and
+        whether it is in the box.
+        """
         name = current(world)
         return {
             **observe_hand(world),
             BOX: world.at(BOX),
-            **{key.replace(name, "next", 1): value for key, value in observe_object(world, name).items()},
+            **{
+                key.replace(name, "next", 1): value
+                for key, value in observe_object(world, name).items()
+            },
             "place_from_next": _to(world) - world.at(name),
             **{one: world.at(one) for one in COLOURS},
             **{f"{one}.in_box": float(_inside(world, one)) for one in COLOURS},
         }
 
     def error(self, world: World) -> float:
-        """Return the distance from the box's middle, summed over the cubes that are not inside [m]."""
+        """Return the distance from the box's middle, summed over the cubes that are not inside
+        [m].
+        """
         at = world.at(BOX)
         return sum(math.dist(world.at(name), at) for name in _left(world))
 

@@ -49,21 +49,26 @@ HAND_Z = BAR_Z - 0.005  # height of the hand at the handle [m]
 HALF = 0.02  # half the cube's edge length [m]
 OPEN_ENOUGH, SHUT = 0.09, 0.008  # opening that lets the object in; largest that counts as shut [m]
 FINGERS = 0.045  # opening of the fingers around the handle [m]
-SLACK = FINGERS / 2 - BAR_HALF  # play of the hand along the pull before a finger meets the handle [m]
+# play of the hand along the pull before a finger meets the handle [m]
+SLACK = FINGERS / 2 - BAR_HALF
 AROUND = (0.024, 0.03, 0.018)  # largest offset of the moving hand from the handle [m]
 AROUND_ANGLE = 0.25  # [rad]
 SPARE = 0.012  # deviation from `FINGERS` up to which the fingers fit around the handle [m]
 HOVER = 0.08  # greatest height of the hand over the handle on its way there [m]
 FUNNEL = LiftProfile(HOVER, slope=2.0, free=0.006)  # that height, by the hand's misalignment
-BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.08  # object's offset from the handle at the start: most in x, least in y [m]
+# object's offset from the handle at the start: most in x, least in y [m]
+BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.08
 DROP = 0.018  # height of the object over the drawer's floor at release [m]
 OVER = 0.13  # height of the hand over the object on approach [m]
-OVER_FRONT = LiftProfile(most=0.085, slope=2.5, free=0.012, rise_first=0.03, max_step=0.06)  # into the drawer
-OVER_TABLE = LiftProfile(most=0.04, slope=0.6, free=0.012, rise_first=0.03, max_step=0.06)  # to a place beside it
+# into the drawer
+OVER_FRONT = LiftProfile(most=0.085, slope=2.5, free=0.012, rise_first=0.03, max_step=0.06)
+# to a place beside it
+OVER_TABLE = LiftProfile(most=0.04, slope=0.6, free=0.012, rise_first=0.03, max_step=0.06)
 MUCH_NEARER = 2.3  # how much nearer the yaw -pi/2 at the handle must be to be chosen [rad]
-LEFT = (0.03, 0.06, 0.03)  # offset from the handle beyond which the hand need not rise first: x, y, z [m]
-# In the cabinet's frame [m]: where an object is in the handle's way, x and y; x below which it lies in front of the
-# closed handle; and where it is put aside.
+# offset from the handle beyond which the hand need not rise first: x, y, z [m]
+LEFT = (0.03, 0.06, 0.03)
+# In the cabinet's frame [m]: where an object is in the handle's way, x and y; x below which it lies
+# in front of the closed handle; and where it is put aside.
 WAY_X = (-0.20, 0.07)
 WAY_Y = 0.12
 BEFORE = -0.06
@@ -80,9 +85,17 @@ def add_cabinet(spec: mujoco.MjSpec) -> None:
     back = front + 2 * deep
     whole = wide + 2 * THIN
     for side, y in (("left", wide + THIN), ("right", -(wide + THIN))):
-        add_part(cabinet, f"cabinet {side}", (deep, THIN, ROOF / 2), (front + deep, y, ROOF / 2), WOOD)
+        add_part(
+            cabinet, f"cabinet {side}", (deep, THIN, ROOF / 2), (front + deep, y, ROOF / 2), WOOD
+        )
     add_part(cabinet, "cabinet back", (THIN, whole, ROOF / 2), (back + THIN, 0, ROOF / 2), WOOD)
-    add_part(cabinet, "cabinet top", (deep + THIN, whole, THIN), (front + deep + THIN, 0, ROOF + THIN), WOOD)
+    add_part(
+        cabinet,
+        "cabinet top",
+        (deep + THIN, whole, THIN),
+        (front + deep + THIN, 0, ROOF + THIN),
+        WOOD,
+    )
     tray = cabinet.add_body(name=TRAY)
     tray.add_joint(
         name=TRAY, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-1, 0, 0], limited=True, range=[0, OPEN],
@@ -92,8 +105,11 @@ def add_cabinet(spec: mujoco.MjSpec) -> None:
     add_part(tray, "drawer floor", (length, width, THIN), (middle, 0, FLOOR - THIN), WOOD)
     for side, y in (("left", width + THIN), ("right", -(width + THIN))):
         add_part(tray, f"drawer {side}", (length, THIN, WALL / 2), (middle, y, WALL / 2), WOOD)
-    back_z, back_half = (ROOF - THIN + FLOOR) / 2, (ROOF - THIN - FLOOR) / 2  # so high that nothing gets behind it
-    add_part(tray, "drawer back", (THIN, width, back_half), (front + 2 * length + THIN, 0, back_z), WOOD)
+    # so high that nothing gets behind it
+    back_z, back_half = (ROOF - THIN + FLOOR) / 2, (ROOF - THIN - FLOOR) / 2
+    add_part(
+        tray, "drawer back", (THIN, width, back_half), (front + 2 * length + THIN, 0, back_z), WOOD
+    )
     add_part(tray, "drawer front", (THIN, whole, PANEL / 2), (GAP + THIN, 0, PANEL / 2), WOOD)
     add_part(tray, BAR, (BAR_HALF, BAR_LENGTH, BAR_HALF), (0, 0, BAR_Z), GREY)
     for side, y in (("left", BAR_LENGTH), ("right", -BAR_LENGTH)):
@@ -123,9 +139,11 @@ def is_in_drawer(world: World) -> bool:
 
 
 def _yaw(world: World) -> float:
-    """Yaw at which the fingers close along the drawer's motion [rad]: pi/2, or -pi/2 if that is much nearer.
+    """Yaw at which the fingers close along the drawer's motion [rad]: pi/2, or -pi/2 if that is
+    much nearer.
 
-    From most starts both are about equally near; if the nearer were taken, a learner would stop between them.
+    From most starts both are about equally near; if the nearer were taken, a learner would stop
+    between them.
     """
     at, quarter = angle_ahead(world.ee.rotation), math.pi / 2
     return quarter if abs(quarter - at) < abs(-quarter - at) + MUCH_NEARER else -quarter
@@ -142,7 +160,9 @@ def _to_bar(world: World) -> Target:
     ee = world.ee
     bar = hand_at_handle(world)
     yaw = _yaw(world)
-    off = math.hypot(*(bar - ee.position)[:2]) + 0.05 * max(0.0, angle_from_down(ee.rotation, yaw) - 0.1)
+    off = math.hypot(*(bar - ee.position)[:2]) + 0.05 * max(
+        0.0, angle_from_down(ee.rotation, yaw) - 0.1
+    )
     height = FUNNEL.over(off)
     if abs(world.opening - FINGERS) > SPARE:
         height = max(height, 0.05)
@@ -153,7 +173,9 @@ def _move_drawer(world: World, to: float) -> Target:
     """Move the drawer by its handle until it is open by `to` [m]."""
     way = pulled(world) - to
     step = way + math.copysign(SLACK, way)
-    return Target(hand_at_handle(world) + [step, 0.0, 0.0], hand_down(_yaw(world)), FINGERS, max_step=_STEP)
+    return Target(
+        hand_at_handle(world) + [step, 0.0, 0.0], hand_down(_yaw(world)), FINGERS, max_step=_STEP
+    )
 
 
 def _push(world: World) -> Target:
@@ -194,7 +216,8 @@ def _is_around_bar(world: World) -> bool:
 
 
 def _is_in_way(world: World, farthest: float = WAY_X[1]) -> bool:
-    """Whether the object lies where the handle passes over it, so that the hand cannot grasp it there.
+    """Whether the object lies where the handle passes over it, so that the hand cannot grasp it
+    there.
 
     farthest: upper bound along the cabinet's x [m].
     """
@@ -203,12 +226,16 @@ def _is_in_way(world: World, farthest: float = WAY_X[1]) -> bool:
 
 
 def _must_shut(world: World) -> bool:
-    """Whether to shut the drawer first: the object lies in its way, in front of the closed handle."""
+    """Whether to shut the drawer first: the object lies in its way, in front of the closed
+    handle.
+    """
     return _is_in_way(world, BEFORE) and not _is_shut(world)
 
 
 def _must_open(world: World) -> bool:
-    """Whether to open the drawer: it is not open, and the object does not lie in front of the closed handle."""
+    """Whether to open the drawer: it is not open, and the object does not lie in front of the
+    closed handle.
+    """
     return not _is_open(world) and not _is_in_way(world, BEFORE)
 
 
@@ -240,7 +267,11 @@ class Drawer(Task):
         Rung("let_go", lambda w: is_in_drawer(w) and _hand_is_in(w), _let_go),
         Rung("push", lambda w: is_in_drawer(w) and _at_bar(w), _push),
         Rung("to_push", is_in_drawer, _to_bar),
-        Rung("carry", lambda w: is_held(w, OBJECT) and _is_open(w), lambda w: carry(w, OBJECT, _place(w), OVER_FRONT)),
+        Rung(
+            "carry",
+            lambda w: is_held(w, OBJECT) and _is_open(w),
+            lambda w: carry(w, OBJECT, _place(w), OVER_FRONT),
+        ),
         Rung("set_down", lambda w: is_held(w, OBJECT) and _is_set_down(w), _let_go),
         Rung("put_aside", lambda w: is_held(w, OBJECT), _put_aside),
         Rung("make_way", lambda w: _must_shut(w) and _at_bar(w), _push),
@@ -257,7 +288,9 @@ class Drawer(Task):
         add_cabinet(spec)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw where the cabinet stands, left or right, and the cube beside its drawer, at any yaw."""
+        """Draw where the cabinet stands, left or right, and the cube beside its drawer, at any
+        yaw.
+        """
         x, y = world.robot.workspace.centre
         side = rng.choice([-1.0, 1.0])
         cabinet = np.array([x + rng.uniform(0.03, 0.07), y + side * rng.uniform(0.05, 0.10), 0.0])
@@ -269,7 +302,9 @@ class Drawer(Task):
         return Start({OBJECT: (at, draw_yaw(rng)), CABINET: (cabinet, UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, cube and handle, how far the drawer is open, and the vectors between them."""
+        """Return hand, cube and handle, how far the drawer is open, and the vectors between
+        them.
+        """
         bar = hand_at_handle(world)
         return {
             **observe_hand(world),
@@ -281,8 +316,12 @@ class Drawer(Task):
         }
 
     def error(self, world: World) -> float:
-        """Return how far the drawer is open, plus the object's distance from the drawer's middle (0 if inside) [m]."""
-        missing = 0.0 if is_in_drawer(world) else math.dist(world.at(OBJECT), middle_of_drawer(world))
+        """Return how far the drawer is open, plus the object's distance from the drawer's middle
+        (0 if inside) [m].
+        """
+        missing = (
+            0.0 if is_in_drawer(world) else math.dist(world.at(OBJECT), middle_of_drawer(world))
+        )
         return max(0.0, pulled(world)) + missing
 
     def progress(self, world: World) -> float:

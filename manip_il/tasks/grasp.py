@@ -18,19 +18,25 @@ FUNNEL_SLOPE = 2.0  # height of the hand per misalignment beyond that
 ANGLE_AS_LENGTH = 0.05  # misalignment that a radian of orientation error counts as [m/rad]
 ANGLE_FREE = 0.1  # orientation error that counts for nothing [rad]
 TIGHT = 0.35  # share of the open hand's clearance that misalignment may take up
-OPEN_SLACK = 0.016  # how much wider than the object the hand must open before it descends, if it can [m]
-OPEN_SHARE = 0.6  # the same, as a share of the open gripper's clearance around the object, if that is less
+# how much wider than the object the hand must open before it descends, if it can [m]
+OPEN_SLACK = 0.016
+# the same, as a share of the open gripper's clearance around the object, if that is less
+OPEN_SHARE = 0.6
 PREFER_ZERO = 0.3  # weight of a grasp's own yaw, relative to its angle from the hand's yaw
 WIDTH_AS_ANGLE = 20.0  # extra turn accepted for a grasp that is a metre narrower [rad/m]
 FUNNEL_STEEP = 4.0  # `FUNNEL_SLOPE` if the object has neighbours
-FINGER = (0.014, 0.010, 0.016)  # a finger's thickness, half width, and distance at which a neighbour is clear [m]
+# a finger's thickness, half width, and distance at which a neighbour is clear [m]
+FINGER = (0.014, 0.010, 0.016)
 SHORT = 0.02  # missing room for a finger at which a grasp counts as fully crowded [m]
-BESIDE_JAW, NEARER = 0.008, 0.002  # gap to the fixed jaw as the hand comes down; how much less is tolerated [m]
+# gap to the fixed jaw as the hand comes down; how much less is tolerated [m]
+BESIDE_JAW, NEARER = 0.008, 0.002
 BY_JAW = 0.004  # `FUNNEL_RADIUS` of a hand with one moving jaw [m]
-NARROW = 0.024  # opening beyond the object's width if a neighbour is in the way of the fully open hand [m]
+# opening beyond the object's width if a neighbour is in the way of the fully open hand [m]
+NARROW = 0.024
 CROWDED = 3.0  # extra turn accepted for a grasp whose fingers have room [rad]
 MAX_TILT = 0.3  # tilt of the object off a face above which the hand waits over it [rad]
-CLOSING = (0.022, 0.015, 0.022)  # bounds on the object's centre in the ee frame, x y z, once the fingers close [m]
+# bounds on the object's centre in the ee frame, x y z, once the fingers close [m]
+CLOSING = (0.022, 0.015, 0.022)
 LEAN = 0.5  # lean of a hand at full stretch [rad]
 _MIDDLE = (0.0, 0.0, 0.0)
 _QUARTER = math.pi / 2
@@ -44,11 +50,12 @@ Way = tuple[float, float, float]
 class Lie(NamedTuple):
     """Ways to grasp an object as it lies.
 
-    grasps: for each, the yaw of a downward hand [rad], the object's width between the fingers and length across them
-    [m], and the vector from its centre to the middle between them, (3,) [m]. tall: its height [m]. tilt: angle to its
-    nearest resting pose [rad]. folds: number of its yaws that look alike, 0 if all do. level: the grasps with fingers
-    on upright sides. above: height of its top over the middle between the fingers, by default half `tall` [m].
-    fits: whether the gripper can close around it, if that was checked.
+    grasps: for each, the yaw of a downward hand [rad], the object's width between the fingers and
+    length across them [m], and the vector from its centre to the middle between them, (3,) [m].
+    tall: its height [m]. tilt: angle to its nearest resting pose [rad]. folds: number of its yaws
+    that look alike, 0 if all do. level: the grasps with fingers on upright sides. above: height of
+    its top over the middle between the fingers, by default half `tall` [m]. fits: whether the
+    gripper can close around it, if that was checked.
     """
 
     grasps: tuple[tuple[float, float, float, Way], ...]
@@ -68,14 +75,14 @@ class Lie(NamedTuple):
 class Grasp(NamedTuple):
     """How to grasp an object, and how far the hand is from that grasp.
 
-    offset: of the place to grasp from the middle between the holding pads, in frame `ee` [m]. width, length:
-    its size between the fingers and across them [m]; half: height of its top over that place [m]. settled: it rests on
-    a face, leans on something without moving, or is between the fingers. yaw: a downward hand's yaw to grasp it; angle:
-    the hand's angle to that pose [rad].
-    at: position of `ee` to grasp it [m]. wide: opening of the fingers on approach [m]. open_enough: whether they
-    pass on both sides of it. off: misalignment of the hand, distance and angle as one length [m]. funnel: height over
-    `at` that `off` requires [m]; height: the same, but at most what clears the object's top [m]. lean: how much the
-    hand leans to reach it, 0 to 1.
+    offset: of the place to grasp from the middle between the holding pads, in frame `ee` [m].
+    width, length: its size between the fingers and across them [m]; half: height of its top over
+    that place [m]. settled: it rests on a face, leans on something without moving, or is between
+    the fingers. yaw: a downward hand's yaw to grasp it; angle: the hand's angle to that pose [rad].
+    at: position of `ee` to grasp it [m]. wide: opening of the fingers on approach [m]. open_enough:
+    whether they pass on both sides of it. off: misalignment of the hand, distance and angle as one
+    length [m]. funnel: height over `at` that `off` requires [m]; height: the same, but at most what
+    clears the object's top [m]. lean: how much the hand leans to reach it, 0 to 1.
     """
 
     offset: tuple[float, float, float]
@@ -100,7 +107,9 @@ def is_cube(world: World, name: str) -> bool:
 
 
 def once_per_state[F: Callable[..., Any]](compute: F) -> F:
-    """Return `compute`, a function of a world and names in it, with each result cached until the world changes."""
+    """Return `compute`, a function of a world and names in it, with each result cached until the
+    world changes.
+    """
 
     @wraps(compute)
     def read(world: World, *names: str) -> Any:
@@ -113,7 +122,11 @@ def once_per_state[F: Callable[..., Any]](compute: F) -> F:
 def lie_of(world: World, name: str) -> Lie:
     """Return the ways to grasp an object as it lies."""
     rotation, hull = world.pose(name).rotation, world.hull(name)
-    return _lie(world.kind(name), rotation, world.extents(name)) if hull is None else _hull_lie(hull, rotation)
+    return (
+        _lie(world.kind(name), rotation, world.extents(name))
+        if hull is None
+        else _hull_lie(hull, rotation)
+    )
 
 
 @once_per_state
@@ -136,7 +149,8 @@ def grasp_of(world: World, name: str) -> Grasp:
     dx = x - ee_x
     dy = y - ee_y
     dz = z - ee_z
-    aside = world.gripper.middle(width + 2 * BESIDE_JAW)  # offset of the object for one moving jaw [m]
+    # offset of the object for one moving jaw [m]
+    aside = world.gripper.middle(width + 2 * BESIDE_JAW)
     at_x, at_y = x - aside * math.sin(yaw), y + aside * math.cos(yaw)
     room = max(0.0, world.gripper.most - width)  # clearance of the open gripper [m]
     free = min(ANGLE_FREE, TIGHT * room / width)
@@ -145,7 +159,9 @@ def grasp_of(world: World, name: str) -> Grasp:
     away = math.hypot(*(_beside_jaw(*way, yaw, -dz < half) if world.gripper.lopsided else way))
     off = away + ANGLE_AS_LENGTH * max(0.0, angle - free)
     slope = FUNNEL_STEEP if neighbours else FUNNEL_SLOPE
-    funnel = slope * max(0.0, off - min(BY_JAW if world.gripper.lopsided else FUNNEL_RADIUS, TIGHT * room))
+    funnel = slope * max(
+        0.0, off - min(BY_JAW if world.gripper.lopsided else FUNNEL_RADIUS, TIGHT * room)
+    )
     crowding = 1.0 if world.gripper.lopsided else _crowding(yaw, world.gripper.most, neighbours)
     narrower = max(0.0, room - NARROW) * crowding
     across, along, ahead = (a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist())
@@ -169,7 +185,8 @@ def grasp_of(world: World, name: str) -> Grasp:
 
 
 def _beside_jaw(x: float, y: float, yaw: float, around: bool) -> tuple[float, float]:
-    """Distances left to an object, across and along the motion of the one moving jaw, less what is tolerated [m].
+    """Distances left to an object, across and along the motion of the one moving jaw, less what is
+    tolerated [m].
 
     around: the jaws are on both sides of it, so that it may touch the fixed one.
     """
@@ -182,11 +199,13 @@ def _beside_jaw(x: float, y: float, yaw: float, around: bool) -> tuple[float, fl
 def _nearest(
     lie: Lie, world: World, position: F64, widest: float, neighbours: Sequence[tuple[float, float]]
 ) -> tuple[float, float, float, Way]:
-    """The grasp whose yaw is nearest to the hand's, with a small preference for zero yaw and narrow grasps.
+    """The grasp whose yaw is nearest to the hand's, with a small preference for zero yaw and narrow
+    grasps.
 
-    It depends on the hand so that a learner does not stop between two grasps, where it averages their labels: any turn
-    makes one of them the nearer. position: the object's (3,) [m]. widest: width that the fingers go around [m].
-    neighbours: offsets (x, y) [m] of what stands around the object; grasps that they obstruct come last.
+    It depends on the hand so that a learner does not stop between two grasps, where it averages
+    their labels: any turn makes one of them the nearer. position: the object's (3,) [m]. widest:
+    width that the fingers go around [m]. neighbours: offsets (x, y) [m] of what stands around the
+    object; grasps that they obstruct come last.
     """
     grasps = lie.grasps[lie.level]
     at = world.hand_yaw
@@ -245,10 +264,14 @@ def _hull_lie(hull: Hull, rotation: F64) -> Lie:
     rest, tilt = hull.rest(nearest), math.acos(min(1.0, float(cosines[nearest])))
     centres = [(x, y, z) for x, y, z in rest.centre.dot(rotation.T).tolist()]
     if rest.round:
-        grasps = tuple((0.0, *size, centre) for size, centre in zip(rest.sizes, centres, strict=True))
+        grasps = tuple(
+            (0.0, *size, centre) for size, centre in zip(rest.sizes, centres, strict=True)
+        )
         return Lie(grasps, rest.tall, tilt, 0, above=rest.above, fits=rest.fits)
     grasps = []
-    for (ahead, left, _), size, centre in zip(rest.across.dot(rotation.T).tolist(), rest.sizes, centres, strict=True):
+    for (ahead, left, _), size, centre in zip(
+        rest.across.dot(rotation.T).tolist(), rest.sizes, centres, strict=True
+    ):
         yaw = math.atan2(left, ahead) + _QUARTER
         yaw -= math.pi * round(yaw / math.pi)
         grasps += [(yaw + turn, *size, centre) for turn in _HALF_TURNS]
@@ -256,7 +279,10 @@ def _hull_lie(hull: Hull, rotation: F64) -> Lie:
 
 
 def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
-    """The lie of a box on its nearest face; its yaw is that of the side nearest to x or y, modulo a quarter turn."""
+    """The lie of a box on its nearest face.
+
+    Its yaw is that of the side nearest to x or y, modulo a quarter turn.
+    """
     ahead, left, vertical = rotation.tolist()
     heights = [abs(height) for height in vertical]
     up = heights.index(max(heights))
@@ -276,7 +302,9 @@ def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
     tilt = math.acos(min(1.0, heights[up]))
     level = slice(None)
     if tilt >= MAX_TILT:  # it stands on an edge: the fingers meet the two sides that are upright
-        level = slice(0, 1) if (heights[side] > heights[other]) != bool(quarters % 2) else slice(1, 3)
+        level = (
+            slice(0, 1) if (heights[side] > heights[other]) != bool(quarters % 2) else slice(1, 3)
+        )
     return Lie(grasps, extents[up], tilt, folds, level)
 
 
@@ -286,7 +314,9 @@ def share(number: float) -> float:
 
 
 def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
-    """Return the angle of a hand (3, 3) from pointing down [rad], less what it may lean (`lean`: 0 to 1)."""
+    """Return the angle of a hand (3, 3) from pointing down [rad], less what it may lean (`lean`:
+    0 to 1).
+    """
     free = min(angle_off_vertical(hand), lean * LEAN)
     return math.sqrt(max(0.0, angle * angle - free * free))
 

@@ -37,14 +37,17 @@ SIDE = 0.058
 LENGTH = 0.10
 MASS = 0.15
 DEPTH, WALL = 0.03, 0.018  # depth of the hole, and thickness of the walls around it [m]
-CHAMFER, SLIPPERY = 0.005, 0.05  # chamfer of the walls' inner edges, as high as wide [m], and its friction
+# chamfer of the walls' inner edges, as high as wide [m], and its friction
+CHAMFER, SLIPPERY = 0.005, 0.05
 GUIDED = 0.003  # peg error up to which the chamfer guides it into the hole [m]
-AT_RIM, GENTLE = 0.005, 0.003  # within `AT_RIM` of the rim's height, the peg is lowered by at most `GENTLE` [m]
+# within `AT_RIM` of the rim's height, the peg is lowered by at most `GENTLE` [m]
+AT_RIM, GENTLE = 0.005, 0.003
 EXACT = 0.02  # error below which the hand is placed exactly [m]
 IN = 0.003  # distance from the hole's floor at which the peg is inserted [m]
 SIDES, TILTED = (0.6, 1.75), 0.5  # best yaws of a hand tilted by `TILTED` [rad]
 STRAIN = 4.0  # weight of other yaws
-NOT_NEARER = 0.10  # largest distance of the hole from the workspace's middle towards the robot, for a tilted hand [m]
+# largest distance of the hole from the workspace's middle towards the robot, for a tilted hand [m]
+NOT_NEARER = 0.10
 APART = 0.14  # least distance of peg and hole at the start [m]
 NOT_FARTHER = 0.05  # how far beyond the workspace's middle a lying peg may start [m]
 _QUARTER = math.pi / 2
@@ -57,7 +60,9 @@ def is_inserted(world: World) -> bool:
 
 @once_per_state
 def to_hole(world: World) -> Way:
-    """Return the remaining motion of a hanging peg into the hole, in the easiest of the four rotations that fit."""
+    """Return the remaining motion of a hanging peg into the hole, in the easiest of the four
+    rotations that fit.
+    """
     peg = world.pose(PEG)
     hole = world.pose(HOLE)
     hand = world.ee.rotation
@@ -69,7 +74,9 @@ def to_hole(world: World) -> Way:
 
 
 def _strain(hand: F64) -> float:
-    """Cost of a hand's yaw, in radians of turning: a tilted hand should point neither ahead nor backwards."""
+    """Cost of a hand's yaw, in radians of turning: a tilted hand should point neither ahead nor
+    backwards.
+    """
     tilt, yaw = angle_off_vertical(hand), abs(angle_across(hand))
     tilted, (least, most) = min(1.0, tilt / TILTED), SIDES
     return (1 - tilted) * yaw + tilted * STRAIN * max(0.0, least - yaw, yaw - most)
@@ -100,7 +107,9 @@ def _bring(world: World) -> Target:
     if abs(way.low - DEPTH) < AT_RIM:
         missing = max(missing, -GENTLE)
     far = math.hypot(*way.off) > 0.01
-    return move(world, way, missing, sideways_at=0.015 if far else math.inf, exact=way.error < EXACT)
+    return move(
+        world, way, missing, sideways_at=0.015 if far else math.inf, exact=way.error < EXACT
+    )
 
 
 def _insert_or_stay(world: World) -> Target:
@@ -136,7 +145,9 @@ class Insert(Task):
             _add_wall(hole, f"hole {side}", quarter * _QUARTER, inner)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the hole's place and yaw, and the peg away from it, lying half of the time, at any yaw."""
+        """Draw the hole's place and yaw, and the peg away from it, lying half of the time, at
+        any yaw.
+        """
         centre = world.robot.workspace.centre
         side, _, length = world.extents(PEG)
 
@@ -153,11 +164,15 @@ class Insert(Task):
         peg = draw_until(lambda: draw_resting_place(rng, world, PEG, height / 2), fits, world, PEG)
         turn = draw_yaw(rng, np.pi)
         if lies:
-            turn = product(turn, np.array([math.cos(_QUARTER / 2), 0.0, math.sin(_QUARTER / 2), 0.0]))
+            turn = product(
+                turn, np.array([math.cos(_QUARTER / 2), 0.0, math.sin(_QUARTER / 2), 0.0])
+            )
         return Start({PEG: (peg, turn), HOLE: (hole, draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, peg, hole, the vectors between them, and the hand's remaining rotation vector [rad]."""
+        """Return hand, peg, hole, the vectors between them, and the hand's remaining rotation
+        vector [rad].
+        """
         peg, hole = world.at(PEG), world.pose(HOLE)
         peg_yaw, yaw = lie_of(world, PEG).yaw, angle_ahead(hole.rotation)
         return {
@@ -193,16 +208,30 @@ class Insert(Task):
 
 
 def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
-    """Add a chamfered wall at a yaw [rad] from the hole's middle; inner: distance from there to its inner face [m]."""
+    """Add a chamfered wall at a yaw [rad] from the hole's middle.
+
+    inner: distance from there to its inner face [m].
+    """
     height, steep = DEPTH - CHAMFER, math.pi / 4
     c, s = math.cos(yaw), math.sin(yaw)
     out, thick = inner + WALL / 2, CHAMFER / 2
     half = (WALL / 2, inner + WALL, height / 2)
     add_part(hole, name, half, (c * out, s * out, height / 2), GREY)
     hole.geoms[-1].quat = turn_left(yaw)
-    out, up = inner + CHAMFER / 2 + thick * math.sin(steep), height + CHAMFER / 2 - thick * math.cos(steep)
-    add_part(hole, f"{name} edge", (CHAMFER / math.sqrt(2), inner + WALL, thick), (c * out, s * out, up), GREY)
+    out, up = (
+        inner + CHAMFER / 2 + thick * math.sin(steep),
+        height + CHAMFER / 2 - thick * math.cos(steep),
+    )
+    add_part(
+        hole,
+        f"{name} edge",
+        (CHAMFER / math.sqrt(2), inner + WALL, thick),
+        (c * out, s * out, up),
+        GREY,
+    )
     edge = hole.geoms[-1]
-    edge.quat = product(turn_left(yaw), np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0]))
+    edge.quat = product(
+        turn_left(yaw), np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0])
+    )
     edge.friction = [SLIPPERY, 0.005, 0.0001]
     edge.priority = 1

@@ -1,8 +1,10 @@
-"""Rungs that tasks share: how a hand closes around an object, holds it and carries it, as pure geometry of a world.
+"""Rungs that tasks share: how a hand closes around an object, holds it and carries it, as pure
+geometry of a world.
 
-Within a rung targets are continuous in the state, and the approach is one funnel rather than waypoints: the nearer the
-hand is to being over the object, the lower it may go. Neighbouring states then have neighbouring labels, which a
-learner can fit. The fingers' contacts show whether an object is held; nothing is stored.
+Within a rung targets are continuous in the state, and the approach is one funnel rather than
+waypoints: the nearer the hand is to being over the object, the lower it may go. Neighbouring states
+then have neighbouring labels, which a learner can fit. The fingers' contacts show whether an object
+is held; nothing is stored.
 """
 
 import math
@@ -22,11 +24,14 @@ Place = Callable[[World], F64]  # returns the target of that object's centre, (3
 
 CLEAR = 0.03  # clearance of the hand over the object's top at which the fingertips are above it [m]
 RISE_FIRST = 0.03  # a hand this far below its path only rises [m]
-AT_GRASP = (0.015, 0.015, 0.015)  # bounds on the object's centre in the ee frame, x y z, to start closing [m]
+# bounds on the object's centre in the ee frame, x y z, to start closing [m]
+AT_GRASP = (0.015, 0.015, 0.015)
 AT_GRASP_ANGLE = 0.3  # [rad]
 EMPTY = 0.4  # opening, as a share of a mesh's width, below which the fingers have missed it
-LEAST_DEEP, DEEP_SHARE = 0.004, 0.15  # tolerated height over a mesh's grasp [m], and as a share of its height
-IN_HAND = (0.009, 0.020, 0.011)  # bounds on a held object's centre in the ee frame, x and z beyond half its size [m]
+# tolerated height over a mesh's grasp [m], and as a share of its height
+LEAST_DEEP, DEEP_SHARE = 0.004, 0.15
+# bounds on a held object's centre in the ee frame, x and z beyond half its size [m]
+IN_HAND = (0.009, 0.020, 0.011)
 RELEASE = 0.03  # how much wider than an object the hand opens to release it, if it can [m]
 FREED = 0.4  # share of that extra opening at which the object is free
 AT_GOAL = 0.01  # [m]
@@ -38,8 +43,9 @@ _GRASPED = 0.5  # progress of an object that is held
 class LiftProfile(NamedTuple):
     """Height of a carried object over its goal, by the horizontal distance still to go [m].
 
-    most: height far from the goal [m]. slope: height per metre beyond `free`, the distance up to which it is 0 [m].
-    rise_first: an object this far below that height, or farther, only rises [m]. max_step: see `Target` [m].
+    most: height far from the goal [m]. slope: height per metre beyond `free`, the distance up to
+    which it is 0 [m]. rise_first: an object this far below that height, or farther, only rises [m].
+    max_step: see `Target` [m].
     """
 
     most: float = 0.05
@@ -60,7 +66,9 @@ def is_held(world: World, name: str) -> bool:
     """Return whether the object is between the fingers and each of them touches it."""
     x, y, z = IN_HAND
     half = max(world.extents(name)) / 2
-    if math.dist(world.at(name).tolist(), world.ee.position.tolist()) > math.hypot(half + x, y, half + z):
+    if math.dist(world.at(name).tolist(), world.ee.position.tolist()) > math.hypot(
+        half + x, y, half + z
+    ):
         return False  # too far away; grasps need not be computed
     if world.hull(name) is None:
         g = grasp_of(world, name)
@@ -73,7 +81,10 @@ def is_held(world: World, name: str) -> bool:
 
 
 def at_grasp(world: World, name: str) -> bool:
-    """Return whether closing the fingers now would hold the object; bounds are wider once they have begun to close."""
+    """Return whether closing the fingers now would hold the object.
+
+    Bounds are wider once they have begun to close.
+    """
     g = grasp_of(world, name)
     box = AT_GRASP if g.open_enough else CLOSING
     if world.hull(name) is not None:
@@ -86,30 +97,37 @@ def at_grasp(world: World, name: str) -> bool:
 
 
 def rise_first(at: F64, to: Sequence[float] | F64) -> F64:
-    """Return the next target from a point (3,) towards another, (3,) [m]: straight up if far below the other."""
+    """Return the next target from a point (3,) towards another, (3,) [m]: straight up if far
+    below the other.
+    """
     (x, y, z), (to_x, to_y, to_z) = at.tolist(), to
     sideways = share(1.0 - (to_z - z) / RISE_FIRST)
     return np.array([x + sideways * (to_x - x), y + sideways * (to_y - y), to_z])
 
 
 def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> Target:
-    """Approach from above: over the object and down around it, fingers open; a hand too low beside it only rises.
+    """Approach from above: over the object and down around it, fingers open.
 
-    hover: height over the grasp on the way there, if more than what clears the object's top [m]; rise: least height
-    over the grasp [m].
+    A hand too low beside it only rises.
+
+    hover: height over the grasp on the way there, if more than what clears the object's top [m];
+    rise: least height over the grasp [m].
     """
     g = grasp_of(world, name)
     x, y, z = g.at
     height = max(g.height, min(hover, g.funnel), rise)
     height = height if g.open_enough and g.settled else max(height, g.half + CLEAR)
-    return Target(rise_first(world.ee.position, (x, y, z + height)), hand_down(g.yaw), g.wide, lean=g.lean)
+    return Target(
+        rise_first(world.ee.position, (x, y, z + height)), hand_down(g.yaw), g.wide, lean=g.lean
+    )
 
 
 def close_on(world: World, name: str) -> Target:
     """Close the fingers on the object, where it is."""
     g = grasp_of(world, name)
     at = np.array(g.at)
-    if world.gripper.lopsided:  # the moving jaw pushes the object to the fixed one; the hand does not follow
+    # the moving jaw pushes the object to the fixed one; the hand does not follow
+    if world.gripper.lopsided:
         across = np.array([math.sin(g.yaw), -math.cos(g.yaw), 0.0])
         at += across * float(across @ (world.ee.position - at))
     return Target(at, hand_down(g.yaw), CLOSED, lean=g.lean)
@@ -127,7 +145,9 @@ def carry(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) ->
 
 
 def let_go(world: World, name: str, height: float) -> Target:
-    """Open the fingers just enough to free an object, then rise straight to a height over its centre [m]."""
+    """Open the fingers just enough to free an object, then rise straight to a height over its
+    centre [m].
+    """
     g, ee = grasp_of(world, name), world.ee
     beyond = min(RELEASE, world.gripper.most - g.width)
     free = world.opening > g.width + FREED * beyond and not world.touched(name)
@@ -140,7 +160,9 @@ def let_go(world: World, name: str, height: float) -> Target:
 
 
 def hand_is_at(world: World, name: str, aside: float, above: float) -> bool:
-    """Return whether the hand is at an object, at most `aside` beside it and `above` over it [m]."""
+    """Return whether the hand is at an object, at most `aside` beside it and `above` over it
+    [m].
+    """
     x, y, z = (world.ee.position - world.at(name)).tolist()
     return math.hypot(x, y) < aside and z < above
 
@@ -148,7 +170,10 @@ def hand_is_at(world: World, name: str, aside: float, above: float) -> bool:
 def grasp_rungs(
     which: Which, hover: float = 0.0, approach: Callable[[World, str, float], Target] = approach
 ) -> tuple[Rung, ...]:
-    """Return the ladder that gets the fingers around an object and closes them; hover: see `approach`."""
+    """Return the ladder that gets the fingers around an object and closes them.
+
+    hover: see `approach`.
+    """
 
     def near(world: World) -> bool:
         g = grasp_of(world, which(world))
@@ -169,7 +194,10 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
     """Return the ladder that grasps an object and carries it to the goal."""
 
     def at_goal(world: World) -> bool:
-        return is_held(world, name) and math.dist(world.at(name).tolist(), world.goal.tolist()) < AT_GOAL
+        return (
+            is_held(world, name)
+            and math.dist(world.at(name).tolist(), world.goal.tolist()) < AT_GOAL
+        )
 
     def to_goal(world: World) -> Target:
         return carry(world, name, world.goal)
@@ -182,7 +210,10 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
 
 
 def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> float:
-    """Return progress of getting the fingers around an object, 0 to 1, by distance; hover, rise: see `approach`."""
+    """Return progress of getting the fingers around an object, 0 to 1, by distance.
+
+    Hover, rise: see `approach`.
+    """
     g = grasp_of(world, name)
     above = float(world.ee.position[2]) - g.at[2]
     height = max(g.height, min(hover, g.funnel), rise)
@@ -190,14 +221,17 @@ def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.
 
 
 def pick_progress(world: World, name: str) -> float:
-    """Return progress of grasping an object and carrying it to the goal, 0 to 1, by the distance left on that path."""
+    """Return progress of grasping an object and carrying it to the goal, 0 to 1, by the distance
+    left on that path.
+    """
     if is_held(world, name):
         return _GRASPED + (1 - _GRASPED) * carry_progress(world, name, world.goal)
     return 0.9 * _GRASPED * grasp_progress(world, name)
 
 
 def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) -> float:
-    """Return progress of carrying a held object to a point (3,) [m], 0 to 1, by the distance left on `carry`'s path.
+    """Return progress of carrying a held object to a point (3,) [m], 0 to 1, by the distance left
+    on `carry`'s path.
 
     That path goes up, sideways, and down.
     """
@@ -208,5 +242,8 @@ def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = OVER_NO
 
 
 def nearness(rest: float) -> float:
-    """Return 1 if at most `AT_GOAL` [m] is left; it falls towards 0 as more is left. rest: distance left [m]."""
+    """Return 1 if at most `AT_GOAL` [m] is left.
+
+    It falls towards 0 as more is left. rest: distance left [m].
+    """
     return _HALFWAY / (_HALFWAY + max(0.0, rest - AT_GOAL))

@@ -25,7 +25,11 @@ SHAPES = {**GEOMS, ANY: GEOMS["box"], MESH: mujoco.mjtGeom.mjGEOM_MESH}
 
 
 def add_cube(
-    spec: mujoco.MjSpec, name: str, half: float = CUBE_HALF, mass: float = CUBE_MASS, colour: tuple[float, ...] = RED
+    spec: mujoco.MjSpec,
+    name: str,
+    half: float = CUBE_HALF,
+    mass: float = CUBE_MASS,
+    colour: tuple[float, ...] = RED,
 ) -> None:
     """Add a free cube. half: half its edge [m]; mass [kg]; colour: red, green and blue."""
     add_object(spec, name, "box", [half] * 3, mass, colour)
@@ -40,7 +44,9 @@ def add_object(
     colour: tuple[float, ...],
     mesh: Mesh | None = None,
 ) -> None:
-    """Add a free object. shape: key of `SHAPES`; size: MuJoCo's `geom_size` [m]; mass [kg]; colour: red, green, blue.
+    """Add a free object. shape: key of `SHAPES`; size: MuJoCo's `geom_size` [m]; mass [kg].
+
+    colour: red, green, blue.
 
     mesh: used in place of the size.
     """
@@ -68,8 +74,13 @@ def add_furniture(spec: mujoco.MjSpec, name: str) -> Any:
     return spec.worldbody.add_body(name=name, mocap=True, pos=[0.5, 0, 0])
 
 
-def add_part(body: Any, name: str, half: Sequence[float], at: Sequence[float], colour: tuple[float, ...]) -> None:
-    """Add a solid box to a body. half: half its lengths [m]; at: its middle in the body's frame [m]."""
+def add_part(
+    body: Any, name: str, half: Sequence[float], at: Sequence[float], colour: tuple[float, ...]
+) -> None:
+    """Add a solid box to a body. half: half its lengths [m].
+
+    at: its middle in the body's frame [m].
+    """
     body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -82,7 +93,8 @@ def add_part(body: Any, name: str, half: Sequence[float], at: Sequence[float], c
 
 
 def add_goal(spec: mujoco.MjSpec, *, flat: bool = False) -> None:
-    """Add a goal marker without contacts: a mocap body, so that lockstep environments can share one model.
+    """Add a goal marker without contacts: a mocap body, so that lockstep environments can share one
+    model.
 
     flat: a disc on the table, not a ball in the air.
     """
@@ -90,4 +102,6 @@ def add_goal(spec: mujoco.MjSpec, *, flat: bool = False) -> None:
     body = spec.worldbody.add_body(name=GOAL, mocap=True, pos=[0.5, 0, 0.2])
     shape = mujoco.mjtGeom.mjGEOM_CYLINDER if flat else mujoco.mjtGeom.mjGEOM_SPHERE
     size = [0.03, 0.001, 0] if flat else [0.02, 0, 0]
-    body.add_geom(name=GOAL, type=shape, size=size, material=material.name, contype=0, conaffinity=0, mass=0)
+    body.add_geom(
+        name=GOAL, type=shape, size=size, material=material.name, contype=0, conaffinity=0, mass=0
+    )

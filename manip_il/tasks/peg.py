@@ -1,4 +1,7 @@
-"""A peg: grip it, set it upright, release and catch it, and move it; the ladder and progress of tasks with a peg."""
+"""A peg: grip it, set it upright, release and catch it, and move it.
+
+The ladder and progress of tasks with a peg.
+"""
 
 import math
 from collections.abc import Callable
@@ -8,7 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.robots.geometry import angle_across, angle_between, rotation_matrix, rotation_vector, turn_about_z
+from manip_il.robots.geometry import (
+    angle_across,
+    angle_between,
+    rotation_matrix,
+    rotation_vector,
+    turn_about_z,
+)
 from manip_il.robots.reach import ARRIVES, reach_of
 from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import SCENES_KEPT, Scene, World
@@ -16,41 +25,55 @@ from manip_il.tasks.grasp import OPEN_SLACK, is_inside, lie_of, once_per_state, 
 from manip_il.tasks.ladder import CLOSED, LiftProfile, nearness, rise_first
 
 PEG, HOLE = "peg", "hole"
-_OPEN_SHARE = 0.85  # least opening beyond the peg, as a share of the most possible, if less than `OPEN_SLACK`
+# least opening beyond the peg, as a share of the most possible, if less than `OPEN_SLACK`
+_OPEN_SHARE = 0.85
 FROM_END = 0.04  # distance of the grip from the peg's upper end [m]
 LOWEST = 0.024  # least height of the hand over the table at a lying peg [m]
-BACK = 0.05  # a held peg's upper end is the one nearer to a point that is this far behind the hand [m]
+# a held peg's upper end is the one nearer to a point that is this far behind the hand [m]
+BACK = 0.05
 STANDS = 0.4  # tilt below which the peg stands and is grasped from above [rad]
-LEAN = math.radians(69)  # lean of the hand back over a lying peg's outer end, which leaves less to turn [rad]
-LEAN_BY_ROOM = 3.0  # largest lean per distance to the end of the arm's reach: leaning moves the wrist outwards [rad/m]
-AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # errors up to which to close, to keep closing [m]
+# lean of the hand back over a lying peg's outer end, which leaves less to turn [rad]
+LEAN = math.radians(69)
+# largest lean per distance to the end of the arm's reach: leaning moves the wrist outwards [rad/m]
+LEAN_BY_ROOM = 3.0
+# errors up to which to close, to keep closing [m]
+AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)
 AT_ANGLE = 0.25  # angle to the grip up to which to close [rad]
 OVER = 0.065  # greatest height over the grip on approach [m]
-FUNNEL = LiftProfile(OVER, slope=2.0, free=0.006)  # height over the grip, by the hand's misalignment
+# height over the grip, by the hand's misalignment
+FUNNEL = LiftProfile(OVER, slope=2.0, free=0.006)
 BARE = 0.012  # how far outside the peg's faces and ends a hand that holds it may be [m]
-ASLANT = 0.75  # angle to the peg's axis above which the hand must set the peg up before carrying it [rad]
+# angle to the peg's axis above which the hand must set the peg up before carrying it [rad]
+ASLANT = 0.75
 LIFT, LIFT_SLOPE = 0.015, 2.5  # height of the peg's lower end over the rim [m]; height per error
 ANGLE_AS_LENGTH = 0.03  # what a radian counts for in these errors [m/rad]
-SLOW, FAST = 0.010, 0.06  # how far ahead of the hand its target runs, at the rim and far from it [m]
-FARTHER = 1.5  # factor on the distance that an exact move aims for, because the arm's weight stops it short
-TURN = 0.15  # how far the target's rotation runs ahead of the hand's, while the hand also moves [rad]
-LET_GO, RELEASE = 0.012, 0.03  # opening beyond the peg's width at which the peg is free, and the one commanded [m]
+# how far ahead of the hand its target runs, at the rim and far from it [m]
+SLOW, FAST = 0.010, 0.06
+# factor on the distance that an exact move aims for, because the arm's weight stops it short
+FARTHER = 1.5
+# how far the target's rotation runs ahead of the hand's, while the hand also moves [rad]
+TURN = 0.15
+# opening beyond the peg's width at which the peg is free, and the one commanded [m]
+LET_GO, RELEASE = 0.012, 0.03
 CLEAR = 0.03  # clearance of the hand over the peg after release [m]
-ASIDE = (math.radians(55), math.radians(70))  # range of yaw, to either side, at which the hand sets the peg up [rad]
-NEAR_MIDDLE = 0.05  # largest distance from the workspace's middle along x at which the peg is set up [m]
+# range of yaw, to either side, at which the hand sets the peg up [rad]
+ASIDE = (math.radians(55), math.radians(70))
+# largest distance from the workspace's middle along x at which the peg is set up [m]
+NEAR_MIDDLE = 0.05
 FROM_HOLE = 0.11  # least distance from the hole at which the peg is set up [m]
 OVER_WALLS = 0.03  # how much higher the peg is carried beside the hole [m]
 SET_DOWN = 0.010  # error at which the peg is down on the table [m]
 ON_TABLE = 0.004  # height of the lower end over the table at which the peg stands [m]
-IN_AIR, BESIDE = 0.006, 0.045  # least height of a falling peg; largest distance of its axis from the hand [m]
+# least height of a falling peg; largest distance of its axis from the hand [m]
+IN_AIR, BESIDE = 0.006, 0.045
 
 
 class Grip(NamedTuple):
     """Grip that the hand aims for: pose of `ee`, position (3,) [m] and rotation (3, 3).
 
-    off: misalignment of the hand, distance and angle as one length [m]; angle: between the rotations of hand and grip
-    [rad]; height: distance to keep above the grip, which grows with the misalignment [m]. open_enough: whether the
-    fingers pass on both sides of the peg.
+    off: misalignment of the hand, distance and angle as one length [m]; angle: between the
+    rotations of hand and grip [rad]; height: distance to keep above the grip, which grows with the
+    misalignment [m]. open_enough: whether the fingers pass on both sides of the peg.
     """
 
     position: F64
@@ -62,7 +85,9 @@ class Grip(NamedTuple):
 
 
 def hand_at(yaw: float, pitch: float) -> F64:
-    """Return `ee`'s rotation (3, 3): the hand points down at `pitch` 0, and level, along `yaw`, at pi/2 [rad]."""
+    """Return `ee`'s rotation (3, 3): the hand points down at `pitch` 0, and level, along `yaw`,
+    at pi/2 [rad].
+    """
     c, s = math.cos(yaw), math.sin(yaw)
     level, upright = math.cos(pitch), math.sin(pitch)
     x = [level * c, level * s, upright]
@@ -80,8 +105,8 @@ def lower_end(world: World) -> F64:
 def upper_axis(world: World) -> F64:
     """Return the direction along the peg to its intended upper end, (3,).
 
-    For a standing peg this is the end on top; for a held peg, the end that the hand points away from; for a lying peg,
-    the end whose yaw is closer to the hand's and to straight ahead.
+    For a standing peg this is the end on top; for a held peg, the end that the hand points away
+    from; for a lying peg, the end whose yaw is closer to the hand's and to straight ahead.
     """
     peg, ee = world.pose(PEG), world.ee
     axis = peg.rotation[:, 2]
@@ -106,7 +131,9 @@ def stands(world: World) -> bool:
 
 @once_per_state
 def holds_peg(world: World) -> bool:
-    """Return whether both fingers touch the peg, and the hand is within the peg's faces and ends or just outside."""
+    """Return whether both fingers touch the peg, and the hand is within the peg's faces and ends
+    or just outside.
+    """
     if not world.touched(PEG):
         return False
     peg = world.pose(PEG)
@@ -129,7 +156,9 @@ def grip_of(world: World) -> Grip:
     position = peg.position + (length / 2 - FROM_END) * axis
     if stands(world):
         at = angle_across(ee.rotation)
-        yaw = min((grasp[0] for grasp in lie_of(world, PEG).grasps), key=lambda yaw: _far_turn(yaw, at))
+        yaw = min(
+            (grasp[0] for grasp in lie_of(world, PEG).grasps), key=lambda yaw: _far_turn(yaw, at)
+        )
         rotation = hand_at(yaw, 0.0)
     else:
         room = _farthest(world.scene) - position[0]
@@ -154,9 +183,10 @@ def _farthest(scene: Scene) -> float:
 class Way(NamedTuple):
     """Remaining motion of a held peg.
 
-    rotation: the hand's once the peg is upright and, if it goes into the hole, aligned with the hole, (3, 3); turn:
-    remaining rotation vector, (3,) [rad]. off: remaining horizontal offset, (2,) [m]. error: off and turn, as one
-    length [m]. low: height of the peg's lower end over the table once the peg is upright [m].
+    rotation: the hand's once the peg is upright and, if it goes into the hole, aligned with the
+    hole, (3, 3); turn: remaining rotation vector, (3,) [rad]. off: remaining horizontal offset,
+    (2,) [m]. error: off and turn, as one length [m]. low: height of the peg's lower end over the
+    table once the peg is upright [m].
     """
 
     rotation: F64
@@ -175,8 +205,8 @@ class Way(NamedTuple):
 def to_stand(world: World) -> Way:
     """Return the remaining motion of a held peg that must stand on the table first.
 
-    The peg turns upright by the smallest rotation, and the hand turns to one side. The peg's place is near the
-    workspace's middle along x, and away from the hole.
+    The peg turns upright by the smallest rotation, and the hand turns to one side. The peg's place
+    is near the workspace's middle along x, and away from the hole.
     """
     hand, axis = world.ee.rotation, upper_axis(world)
     upright = _upright(axis) @ hand
@@ -199,7 +229,9 @@ def _upright(axis: F64) -> F64:
 
 
 def _free_place(world: World, end: F64) -> F64:
-    """Place (3,) [m] on the table to set the peg up, nearest to where its lower end (3,) would be."""
+    """Place (3,) [m] on the table to set the peg up, nearest to where its lower end (3,) would
+    be.
+    """
     x, y, _ = end.tolist()
     middle = world.robot.workspace.centre[0]
     at = np.array([min(middle + NEAR_MIDDLE, max(middle - NEAR_MIDDLE, x)), y, 0.0])
@@ -210,12 +242,14 @@ def _free_place(world: World, end: F64) -> F64:
 def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
     """Return the remaining motion if the hand turns with the peg to a rotation (3, 3).
 
-    to: returns the target of the peg's lower end, given where the turn alone would bring it, (3,) [m].
+    to: returns the target of the peg's lower end, given where the turn alone would bring it, (3,)
+    [m].
     """
     ee, peg = world.ee, world.pose(PEG)
     turn = rotation_vector(rotation @ ee.rotation.T)
     end = peg.position - world.extents(PEG)[2] / 2 * upper_axis(world)
-    turned = ee.position + rotation @ (ee.rotation.T @ (end - ee.position))  # the lower end, once the peg is upright
+    # the lower end, once the peg is upright
+    turned = ee.position + rotation @ (ee.rotation.T @ (end - ee.position))
     off = (to(world, turned) - turned)[:2]
     error = math.hypot(*off) + ANGLE_AS_LENGTH * math.hypot(*turn)
     return Way(rotation, turn, off, error, float(turned[2]))
@@ -231,7 +265,8 @@ def _set_up_height(world: World, way: Way) -> float:
     """Target height of the lower end over the table, greater near the walls of the hole [m]."""
     room = math.dist(world.at(PEG)[:2], world.at(HOLE)[:2]) - FROM_HOLE
     most = LIFT + OVER_WALLS * share(1 - room / OVER_WALLS)
-    tilt = math.acos(min(1.0, float(upper_axis(world)[2])))  # without the hand's yaw, which may be out of reach
+    # without the hand's yaw, which may be out of reach
+    tilt = math.acos(min(1.0, float(upper_axis(world)[2])))
     error = math.hypot(*way.off) + ANGLE_AS_LENGTH * tilt
     return min(most, LIFT_SLOPE * max(0.0, error - SET_DOWN)) - 0.001
 
@@ -239,20 +274,26 @@ def _set_up_height(world: World, way: Way) -> float:
 def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool = False) -> Target:
     """Return the target that moves the peg with the hand.
 
-    missing: height to gain [m]; sideways_at: missing height below which it moves sideways [m]; exact: see `Target`.
+    missing: height to gain [m]; sideways_at: missing height below which it moves sideways [m];
+    exact: see `Target`.
     """
     sideways = share(1.0 - missing / sideways_at)
     turn = TURN * min(1.0, max(0.25, 1.0 - missing / 0.06))
     rotation = way.rotation
     if exact:
-        sideways, rotation = FARTHER * sideways, rotation_matrix((FARTHER - 1) * way.turn) @ rotation
+        sideways, rotation = (
+            FARTHER * sideways,
+            rotation_matrix((FARTHER - 1) * way.turn) @ rotation,
+        )
     position = world.ee.position + np.array([*(sideways * way.off), max(missing, -SLOW)])
     step = min(FAST, SLOW + max(0.0, way.error - 0.02))
     return Target(position, rotation, CLOSED, max_step=step, max_turn=turn, exact=exact)
 
 
 def is_up(world: World) -> bool:
-    """Return whether the peg stands on the table, with an oblique hand around it or just above it."""
+    """Return whether the peg stands on the table, with an oblique hand around it or just above
+    it.
+    """
     x, y, z = (world.ee.position - lower_end(world)).tolist()
     up = float(upper_axis(world)[2]) > math.cos(0.15) and lower_end(world)[2] < ON_TABLE
     return up and is_aslant(world) and math.hypot(x, y) < 0.03 and z < world.extents(PEG)[2] + CLEAR
@@ -276,7 +317,10 @@ def _falls(world: World) -> bool:
     between = abs(beside[1]) < world.opening / 2 and math.hypot(*beside) < BESIDE
     if not between or abs(along) > world.extents(PEG)[2] / 2:
         return False
-    return lie_of(world, PEG).tilt > 0.06 or float(peg.position[2]) - lie_of(world, PEG).tall / 2 > IN_AIR
+    return (
+        lie_of(world, PEG).tilt > 0.06
+        or float(peg.position[2]) - lie_of(world, PEG).tall / 2 > IN_AIR
+    )
 
 
 def _catch(world: World) -> Target:
@@ -308,7 +352,10 @@ def hangs(world: World) -> bool:
 
 
 def peg_progress(world: World) -> float:
-    """Return progress of gripping a peg from above, 0 to 1; a peg that lies must first be set up."""
+    """Return progress of gripping a peg from above, 0 to 1.
+
+    A peg that lies must first be set up.
+    """
     grip = grip_of(world)
     above = float(world.ee.position[2] - grip.position[2])
     if is_up(world):

@@ -1,4 +1,7 @@
-"""Pick and place: move an object to a goal on the table or in the air. Lift: to a goal above its start."""
+"""Pick and place: move an object to a goal on the table or in the air.
+
+Lift: to a goal above its start.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -15,7 +18,15 @@ from manip_il.tasks.grasp import is_cube, lie_of
 from manip_il.tasks.ladder import is_held, pick_progress, pick_rungs
 from manip_il.tasks.objects import CUBE_MASS, RED, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
-from manip_il.tasks.starts import FEW_DRAWS, LIFT, LIFT_HEIGHT, UPRIGHT, draw_goal, draw_lying, draw_until
+from manip_il.tasks.starts import (
+    FEW_DRAWS,
+    LIFT,
+    LIFT_HEIGHT,
+    UPRIGHT,
+    draw_goal,
+    draw_lying,
+    draw_until,
+)
 
 OBJECT = "object"
 ANY_SHAPE = 200  # horizon: small or rolling objects take more attempts than a cube
@@ -23,7 +34,8 @@ ANY_SHAPE = 200  # horizon: small or rolling objects take more attempts than a c
 
 @dataclass(frozen=True)
 class PickPlace(Task):
-    """Bring the object's centre to the goal. Ranges are those of gymnasium-robotics' FetchPickAndPlace.
+    """Bring the object's centre to the goal. Ranges are those of gymnasium-robotics'
+    FetchPickAndPlace.
 
     shape: shape of the object, a 5 cm cube unless `--task.object=` says otherwise.
     """
@@ -41,7 +53,9 @@ class PickPlace(Task):
         """Return the task with another object, which its instruction also names."""
         instruction = self.instruction.replace(self.shape.word, shape.word)
         horizon = self.horizon if shape == CUBE else ANY_SHAPE
-        return replace(self, shape=shape, sizes=shape.sizes, instruction=instruction, horizon=horizon)
+        return replace(
+            self, shape=shape, sizes=shape.sizes, instruction=instruction, horizon=horizon
+        )
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the object and the goal."""
@@ -51,13 +65,17 @@ class PickPlace(Task):
         add_goal(spec)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the object on the table, lying or standing at any yaw, and the goal, in the air half of the time."""
+        """Draw the object on the table, lying or standing at any yaw, and the goal, in the air
+        half of the time.
+        """
         at, turn = draw_lying(rng, world, OBJECT)
         goal = draw_goal(rng, world, float(at[2]))
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, goal, the object as `observe_object` describes it, and the vectors between them."""
+        """Return hand, goal, the object as `observe_object` describes it, and the vectors
+        between them.
+        """
         return {
             **observe_hand(world),
             "goal": world.goal,
@@ -70,7 +88,9 @@ class PickPlace(Task):
         return math.dist(world.at(OBJECT).tolist(), world.goal.tolist())
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label (the mesh, as it lies, is too wide or too low for the gripper), or ""."""
+        """Return why there is no sound label (the mesh, as it lies, is too wide or too low for
+        the gripper), or "".
+        """
         if lie_of(world, OBJECT).fits or is_held(world, OBJECT):
             return ""
         return f"{OBJECT} lies on a side on which it is too low or too wide for the gripper"
@@ -89,7 +109,9 @@ class Lift(PickPlace):
     horizon: int = 150
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the object on the table, lying or standing at any yaw, and the height of the goal over it."""
+        """Draw the object on the table, lying or standing at any yaw, and the height of the goal
+        over it.
+        """
         low, high = np.array(LIFT) * min(1.0, world.robot.workspace.height / LIFT_HEIGHT)
 
         def draw_both() -> dict[str, tuple[F64, F64]]:
@@ -102,7 +124,9 @@ class Lift(PickPlace):
 
 
 def observe_object(world: World, name: str) -> Observed:
-    """Return an object's position, yaw modulo its symmetry, tilt and lengths, and the vector to it from the hand."""
+    """Return an object's position, yaw modulo its symmetry, tilt and lengths, and the vector to
+    it from the hand.
+    """
     position, lie = world.at(name), lie_of(world, name)
     if not world.scene.draws_shape and is_cube(world, name):
         seen: Observed = {

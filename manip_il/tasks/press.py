@@ -21,7 +21,8 @@ STOPPED = 0.002  # distance of the cap from its stop at which it is pressed [m]
 TIP = 0.02  # distance of the fingertips beyond `ee` [m]
 OVER = 0.012  # largest offset of the pressing hand from the button's middle [m]
 DEEPER = 0.012  # how far beyond the stop the hand aims, so that it presses [m]
-FUNNEL = LiftProfile(0.08, slope=2.0, free=OVER)  # clearance over the cap before the hand is above it
+# clearance over the cap before the hand is above it
+FUNNEL = LiftProfile(0.08, slope=2.0, free=OVER)
 _STIFF, _DAMPED = 150.0, 4.0  # stiffness and damping of the spring [N/m], [N s/m]
 
 
@@ -63,12 +64,12 @@ class Press(Task):
         add_part(button, BUTTON, (0.04, 0.04, half), (0, 0, half), GREY)
         cap = button.add_body(name=CAP, pos=[0, 0, TOP])
         cap.add_joint(
-            name=CAP, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1], limited=True, range=[0, TRAVEL],
-            stiffness=[_STIFF, 0, 0], damping=[_DAMPED, 0, 0], armature=0.01,
+            name=CAP, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1], limited=True,
+            range=[0, TRAVEL], stiffness=[_STIFF, 0, 0], damping=[_DAMPED, 0, 0], armature=0.01,
         )  # fmt: skip
         cap.add_geom(
-            name=CAP, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[CAP_RADIUS, 0.01, 0], pos=[0, 0, -0.01],
-            rgba=[*RED, 1], mass=0.05,
+            name=CAP, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[CAP_RADIUS, 0.01, 0],
+            pos=[0, 0, -0.01], rgba=[*RED, 1], mass=0.05,
         )  # fmt: skip
         spec.add_exclude(bodyname1=BUTTON, bodyname2=CAP)
 

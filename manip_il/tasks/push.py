@@ -33,8 +33,9 @@ ROOM = 0.06  # reachable margin behind the puck at the start [m]
 class PushStyle(NamedTuple):
     """Dimensions of a pushing hand. behind: how far behind the puck's middle it starts [m].
 
-    opening: gap between the fingers, so that the puck rests against both [m]. touching: how far behind the puck's
-    middle it touches the puck [m]. lower: replaces `LOW_ENOUGH` at the distance `behind` [m].
+    opening: gap between the fingers, so that the puck rests against both [m]. touching: how far
+    behind the puck's middle it touches the puck [m]. lower: replaces `LOW_ENOUGH` at the distance
+    `behind` [m].
     """
 
     behind: float
@@ -44,7 +45,8 @@ class PushStyle(NamedTuple):
 
 
 UPRIGHT_STYLE = PushStyle(0.05, 0.04, 0.0, LOW_ENOUGH)
-LEANING_STYLE = PushStyle(0.065, 0.02, 0.045, 0.006)  # for a weak arm, which would otherwise come down on the puck
+# for a weak arm, which would otherwise come down on the puck
+LEANING_STYLE = PushStyle(0.065, 0.02, 0.045, 0.006)
 
 
 def _style(world: World) -> PushStyle:
@@ -65,18 +67,29 @@ def _across(world: World, direction: F64) -> F64:
         at, turns = world.turned(puck), world.turns(yaw, math.pi, puck)
     else:
         at, turns = world.hand_yaw, [yaw - math.pi, yaw, yaw + math.pi]
-    return hand_down(min(turns, key=lambda turn: (abs(turn - at) + 0.3 * abs(turn), turn)) + world.ahead(puck))
+    return hand_down(
+        min(turns, key=lambda turn: (abs(turn - at) + 0.3 * abs(turn), turn)) + world.ahead(puck)
+    )
 
 
 def _hand(world: World) -> F64:
-    """Return the point that pushes: the middle between the fingers at the pushing opening, (3,) [m]."""
+    """Return the point that pushes: the middle between the fingers at the pushing opening, (3,)
+    [m].
+    """
     return world.ee.position + world.ee.rotation[:, 1] * world.gripper.middle(_style(world).opening)
 
 
 def _to(world: World, position: F64, direction: F64, max_step: float = 0.12) -> Target:
-    """Target that puts the middle between the fingers at a position (3,) [m], across a push (2,)."""
+    """Target that puts the middle between the fingers at a position (3,) [m], across a push
+    (2,).
+    """
     rotation, opening = _across(world, direction), _style(world).opening
-    return Target(position - rotation[:, 1] * world.gripper.middle(opening), rotation, opening, max_step=max_step)
+    return Target(
+        position - rotation[:, 1] * world.gripper.middle(opening),
+        rotation,
+        opening,
+        max_step=max_step,
+    )
 
 
 def _behind(world: World) -> tuple[float, float]:
@@ -117,7 +130,10 @@ def _push(world: World) -> Target:
 
 
 def _around(world: World) -> Target:
-    """Move over the puck to behind it, descending on the way; a hand too low beside it only rises."""
+    """Move over the puck to behind it, descending on the way.
+
+    A hand too low beside it only rises.
+    """
     hand, to = _hand(world), _place_behind(world)
     off = math.hypot(*(to - hand[:2]))
     height = world.robot.ee.lowest + LOW + FUNNEL.over(off)
@@ -149,13 +165,19 @@ class Push(Task):
         add_goal(spec, flat=True)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the puck, and a goal away from it, placed so that the hand can reach behind the puck."""
+        """Draw the puck, and a goal away from it, placed so that the hand can reach behind the
+        puck.
+        """
         at, height = draw_resting(rng, world, PUCK, ROOM + 0.02), resting_height(world, PUCK)
 
         def fits(goal: F64) -> bool:
             way = goal - at
             distance = math.hypot(way[0], way[1])
-            return distance > FAR and world.reach.has(goal) and world.reach.has(at - ROOM / distance * way)
+            return (
+                distance > FAR
+                and world.reach.has(goal)
+                and world.reach.has(at - ROOM / distance * way)
+            )
 
         goal = draw_until(lambda: np.append(draw_xy(rng, world), height), fits, world, "the goal")
         return Start({PUCK: (at, UPRIGHT), GOAL: (np.append(goal[:2], 0.001), UPRIGHT)})
@@ -163,7 +185,12 @@ class Push(Task):
     def observe(self, world: World) -> Observed:
         """Return hand, goal and puck, and the vectors between them."""
         puck, goal = world.at(PUCK), world.goal
-        seen = {"goal": goal, PUCK: puck, "puck_from_ee": puck - world.ee.position, "goal_from_puck": goal - puck}
+        seen = {
+            "goal": goal,
+            PUCK: puck,
+            "puck_from_ee": puck - world.ee.position,
+            "goal_from_puck": goal - puck,
+        }
         return {**observe_hand(world), **seen}
 
     def error(self, world: World) -> float:

@@ -37,7 +37,11 @@ class ReachGoal(Task):
 
     def observe(self, world: World) -> Observed:
         """Return hand, goal, and the vector between them."""
-        return {**observe_hand(world), "goal": world.goal, "goal_from_ee": world.goal - world.ee.position}
+        return {
+            **observe_hand(world),
+            "goal": world.goal,
+            "goal_from_ee": world.goal - world.ee.position,
+        }
 
     def error(self, world: World) -> float:
         """Return the distance of `ee` from the goal [m]."""
@@ -49,6 +53,8 @@ class ReachGoal(Task):
 
 
 def observe_hand(world: World) -> Observed:
-    """Return the hand's position and its y and z axes, the first entries of every `environment_state`."""
+    """Return the hand's position and its y and z axes, the first entries of every
+    `environment_state`.
+    """
     ee = world.ee
     return {"ee": ee.position, "ee.axis_y": ee.rotation[:, 1], "ee.axis_z": ee.rotation[:, 2]}

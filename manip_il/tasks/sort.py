@@ -10,9 +10,26 @@ from manip_il.mdp import F64
 from manip_il.robots.geometry import angle_ahead, angle_from_down, hand_down
 from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
-from manip_il.tasks.bins import OVER, OVER_WALL, WALL, add_bin, drop_place, drop_rungs, is_in, rise_over
+from manip_il.tasks.bins import (
+    OVER,
+    OVER_WALL,
+    WALL,
+    add_bin,
+    drop_place,
+    drop_rungs,
+    is_in,
+    rise_over,
+)
 from manip_il.tasks.grasp import grasp_of, lie_of, once_per_state, share
-from manip_il.tasks.ladder import CLEAR, CLOSED, approach, grasp_progress, grasp_rungs, is_held, nearness
+from manip_il.tasks.ladder import (
+    CLEAR,
+    CLOSED,
+    approach,
+    grasp_progress,
+    grasp_rungs,
+    is_held,
+    nearness,
+)
 from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, add_furniture
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
@@ -20,7 +37,8 @@ from manip_il.tasks.starts import FROM_HAND, UPRIGHT, draw_until, draw_yaw, rest
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW}
 BINS = {name: f"{name}_bin" for name in COLOURS}
-ASKED = "asked"  # an invisible mocap body: its x is the number of the named cube, its z that of the sentence
+# an invisible mocap body: its x is the number of the named cube, its z that of the sentence
+ASKED = "asked"
 SENTENCES = (
     "Put the {colour} cube into the {colour} bin.",
     "Sort the {colour} cube into its bin.",
@@ -32,7 +50,8 @@ INSIDE = (0.046, 0.068)  # half a bin's inner length and width [m]
 _IN_ROW = 1e-6  # distance from its place in the row beyond which a bin was moved [m]
 PITCH = 0.105  # spacing of the bins, which stand in a row away from the robot [m]
 SIDE = 0.19  # offset of the row from the workspace's middle, left or right [m]
-SHIFT = 0.08  # largest shift of cubes and bins along x, to where the arm reaches farthest to both sides [m]
+# largest shift of cubes and bins along x, to where the arm reaches farthest to both sides [m]
+SHIFT = 0.08
 HALF = 0.018  # half a cube's edge length [m]
 APART = 0.085  # least distance between cubes at the start [m]
 FROM_BINS = 0.14  # least sideways distance of a cube from the row's middle at the start [m]
@@ -40,7 +59,8 @@ BEYOND = 0.15  # largest distance of a cube from the workspace's middle on the s
 LOWER = 0.028  # how far below `drop_place` a cube is released, so that it does not bounce far [m]
 STEP = 0.1  # how far the target runs ahead of the carrying hand: a fast hand drops fewer cubes [m]
 SLOPE = 5.0  # slope of the path around other bins: distance from the row per distance along it
-NEAR_WALL, BY_WALL = 0.045, 0.065  # distances from a wall, in a bin and beside it, below which fingers lack room [m]
+# distances from a wall, in a bin and beside it, below which fingers lack room [m]
+NEAR_WALL, BY_WALL = 0.045, 0.065
 NARROW = 0.024  # opening beyond the width of a cube near a bin's wall [m]
 TURNED = 0.3  # near a wall: angle to the grasp beyond which the hand stays over the cube [rad]
 _HIGH = 0.04  # clearance of a cube that is carried across a bin's walls [m]
@@ -69,7 +89,10 @@ def _place(world: World) -> F64:
 
 
 def _to(world: World) -> F64:
-    """Release point of the named cube, (3,) [m]; shifted off the row of bins until the cube is beside its bin."""
+    """Release point of the named cube, (3,) [m].
+
+    Shifted off the row of bins until the cube is beside its bin.
+    """
     name, place = asked(world), _place(world)
     along = abs(place[0] - world.at(name)[0])
     inwards = math.copysign(1.0, world.robot.workspace.centre[1] - place[1])
@@ -97,7 +120,10 @@ def _put_back(world: World) -> Target:
 
 
 def _free_yaw(world: World) -> float | None:
-    """Yaw at which walls leave room for the fingers, modulo half a turn [rad]; None if there is room all around."""
+    """Yaw at which walls leave room for the fingers, modulo half a turn [rad].
+
+    None if there is room all around.
+    """
     x, y, _ = world.at(asked(world)).tolist()
     along, across, _ = np.array([world.at(one) for one in BINS.values()]).T.tolist()
     off = abs(y - across[0])
@@ -117,11 +143,15 @@ def _approach(world: World, name: str, hover: float) -> Target:
     yaws = (yaw for yaw, _, _, _ in lie_of(world, name).grasps)
     yaw = min(yaws, key=lambda yaw: (round(abs(math.sin(yaw - free)), 6), abs(yaw - hand)))
     low = g.at[2] + g.half + CLEAR if angle_from_down(ee.rotation, yaw) > TURNED else 0.0
-    return Target(np.maximum(target.position, [-np.inf, -np.inf, low]), hand_down(yaw), g.width + NARROW)
+    return Target(
+        np.maximum(target.position, [-np.inf, -np.inf, low]), hand_down(yaw), g.width + NARROW
+    )
 
 
 def _middle(world: World) -> tuple[float, float]:
-    """Middle (x, y) [m] of cubes and bins, chosen so that the arm can also pick up a dropped cube."""
+    """Middle (x, y) [m] of cubes and bins, chosen so that the arm can also pick up a dropped
+    cube.
+    """
     x, y = world.robot.workspace.centre
     line = [(across, height) for across in (-0.2, -0.1, 0.0, 0.1, 0.2) for height in (0.03, 0.15)]
     shifts = [
@@ -134,17 +164,23 @@ def _middle(world: World) -> tuple[float, float]:
 
 
 def _draw_place(rng: np.random.Generator, world: World, name: str, side: float) -> F64:
-    """Draw a cube's resting place, (3,) [m], away from the bins. side: where the bins are, -1 (right) or 1 (left)."""
+    """Draw a cube's resting place, (3,) [m], away from the bins. side: where the bins are, -1
+    (right) or 1 (left).
+    """
     (x, y), wide = _middle(world), world.robot.workspace.half_width
     along, across = rng.uniform(-1, 1) * wide, side * rng.uniform(-BEYOND, SIDE - FROM_BINS)
     return np.array([x + along, y + across, resting_height(world, name)])
 
 
-_LET_GO, _CARRY = drop_rungs(asked, _to, _is_sorted, tuple(COLOURS), OVER_WALL._replace(max_step=STEP))
+_LET_GO, _CARRY = drop_rungs(
+    asked, _to, _is_sorted, tuple(COLOURS), OVER_WALL._replace(max_step=STEP)
+)
 
 
 class Sort(Task):
-    """Put the cube that the instruction names into the bin of its colour, and leave the others on the table."""
+    """Put the cube that the instruction names into the bin of its colour, and leave the others
+    on the table.
+    """
 
     name = "sort"
     instruction = "Put the cube that is named into the bin of its colour."
@@ -171,7 +207,9 @@ class Sort(Task):
         return (asked(world),)
 
     def unsound(self, world: World) -> str:
-        """Return "the bins do not stand in a row" if some bins were moved without the others, else ""."""
+        """Return "the bins do not stand in a row" if some bins were moved without the others,
+        else "".
+        """
         bins = np.array(sorted(world.at(one).tolist() for one in BINS.values()))
         row = bins[0] + np.outer(np.arange(len(bins)), [PITCH, 0.0, 0.0])
         return "" if np.abs(bins - row).max() < _IN_ROW else "the bins do not stand in a row"
@@ -184,7 +222,9 @@ class Sort(Task):
         add_furniture(spec, ASKED).pos = [0, 0, 0]
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw which cube is named, the sentence, the bins' side and order, and the cubes, apart and at any yaw."""
+        """Draw which cube is named, the sentence, the bins' side and order, and the cubes, apart
+        and at any yaw.
+        """
         number, sentence = float(rng.integers(len(COLOURS))), float(rng.integers(len(SENTENCES)))
         poses: dict[str, tuple[F64, F64]] = {ASKED: (np.array([number, 0.0, sentence]), UPRIGHT)}
         (x, y), hand = _middle(world), world.robot.workspace.centre
@@ -195,7 +235,11 @@ class Sort(Task):
         def fits(at: F64) -> bool:
             others = [poses[name][0] for name in COLOURS if name in poses]
             from_hand = math.dist(at[:2], hand) > FROM_HAND
-            return from_hand and world.reach.has(at) and all(math.dist(at, other) > APART for other in others)
+            return (
+                from_hand
+                and world.reach.has(at)
+                and all(math.dist(at, other) > APART for other in others)
+            )
 
         for name in COLOURS:
             at = draw_until(partial(_draw_place, rng, world, name, side), fits, world, name)
@@ -203,12 +247,17 @@ class Sort(Task):
         return Start(poses)
 
     def observe(self, world: World) -> Observed:
-        """Return hand, which cube is named, its pose and vectors to its bin, and all positions of cubes and bins."""
+        """Return hand, which cube is named, its pose and vectors to its bin, and all positions
+        of cubes and bins.
+        """
         name = asked(world)
         return {
             **observe_hand(world),
             **{f"{ASKED}.{other}": float(other == name) for other in COLOURS},
-            **{key.replace(name, "cube", 1): value for key, value in observe_object(world, name).items()},
+            **{
+                key.replace(name, "cube", 1): value
+                for key, value in observe_object(world, name).items()
+            },
             "bin_from_cube": world.at(BINS[name]) - world.at(name),
             "place_from_cube": _to(world) - world.at(name),
             **{other: world.at(other) for other in COLOURS},
@@ -216,13 +265,17 @@ class Sort(Task):
         }
 
     def error(self, world: World) -> float:
-        """Return the named cube's distance from its bin's middle [m], 0 inside, plus 0.1 m per other cube in a bin."""
+        """Return the named cube's distance from its bin's middle [m], 0 inside, plus 0.1 m per
+        other cube in a bin.
+        """
         name = asked(world)
         off = math.dist(world.at(name), world.at(BINS[name]))
         return (0.0 if _is_sorted(world, name) else off) + _WRONG * _wrong(world)
 
     def progress(self, world: World) -> float:
-        """Return progress of grasping the named cube and bringing it to its bin around the others."""
+        """Return progress of grasping the named cube and bringing it to its bin around the
+        others.
+        """
         name = asked(world)
         if _is_sorted(world, name):
             return 1.0 if not _wrong(world) else 0.95

@@ -9,7 +9,15 @@ from manip_il.mdp import F64
 from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import grasp_of, lie_of
-from manip_il.tasks.ladder import LiftProfile, carry, carry_progress, grasp_progress, grasp_rungs, is_held, let_go
+from manip_il.tasks.ladder import (
+    LiftProfile,
+    carry,
+    carry_progress,
+    grasp_progress,
+    grasp_rungs,
+    is_held,
+    let_go,
+)
 from manip_il.tasks.objects import BLUE, RED, add_cube
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
@@ -21,9 +29,11 @@ ON_XY = 0.015
 ON_Z = 0.004
 LEVEL = 0.1
 LEANS_Z, LEANS = 0.008, 0.3  # the same for a cube in a leaning hand: in height [m]; tilt [rad]
-OVER_BASE = LiftProfile(most=0.06, slope=2.5, free=0.008, rise_first=0.03, max_step=0.05)  # carried cube over its place
+# carried cube over its place
+OVER_BASE = LiftProfile(most=0.06, slope=2.5, free=0.008, rise_first=0.03, max_step=0.05)
 PRESS = 0.01  # how far below the base's top the cube is aimed, so that it makes contact [m]
-AWAY, AWAY_ENOUGH = 0.06, 0.035  # heights of the hand over the stack: target after release; least to count as away [m]
+# heights of the hand over the stack: target after release; least to count as away [m]
+AWAY, AWAY_ENOUGH = 0.06, 0.035
 APART = 0.09  # least distance between cubes at the start [m]
 ROOM = 0.05  # reachable margin around each cube at the start [m]
 _HAND = 0.05  # error added while the hand is at the cube [m]
@@ -37,11 +47,15 @@ def place_on_base(world: World) -> F64:
 
 def stands(world: World) -> bool:
     """Return whether the upper cube lies level on the base."""
-    return _is_on_base(world, ON_Z) and max(lie_of(world, TOP).tilt, lie_of(world, BASE).tilt) < LEVEL
+    return (
+        _is_on_base(world, ON_Z) and max(lie_of(world, TOP).tilt, lie_of(world, BASE).tilt) < LEVEL
+    )
 
 
 def _rests(world: World) -> bool:
-    """Whether a leaning hand has put the upper cube on the base, where it will lie level once released."""
+    """Whether a leaning hand has put the upper cube on the base, where it will lie level once
+    released.
+    """
     return world.robot.leans and _is_on_base(world, LEANS_Z) and lie_of(world, TOP).tilt < LEANS
 
 
@@ -88,10 +102,16 @@ class Stack(Task):
         """Draw both cubes on the table, apart, at any yaw."""
         height = (world.extents(BASE)[2] + world.extents(TOP)[2]) / 2
         base = draw_until(
-            lambda: draw_resting(rng, world, BASE, ROOM), lambda at: world.reach.has(at + [0, 0, height]), world, BASE
+            lambda: draw_resting(rng, world, BASE, ROOM),
+            lambda at: world.reach.has(at + [0, 0, height]),
+            world,
+            BASE,
         )
         top = draw_until(
-            lambda: draw_resting(rng, world, TOP, ROOM), lambda at: math.dist(at, base) > APART, world, TOP
+            lambda: draw_resting(rng, world, TOP, ROOM),
+            lambda at: math.dist(at, base) > APART,
+            world,
+            TOP,
         )
         return Start({TOP: (top, draw_yaw(rng)), BASE: (base, draw_yaw(rng))})
 
@@ -105,14 +125,20 @@ class Stack(Task):
         }
 
     def error(self, world: World) -> float:
-        """Return the cube's distance from its place on the base [m], plus 0.05 m until it stands without the hand."""
+        """Return the cube's distance from its place on the base [m], plus 0.05 m until it stands
+        without the hand.
+        """
         off = math.dist(world.at(TOP), place_on_base(world))
         return off + (0.0 if stands(world) and _hand_is_away(world) else _HAND)
 
     def progress(self, world: World) -> float:
         """Return progress of grasping, carrying and letting go."""
         if stands(world):
-            return 1.0 if _hand_is_away(world) else 0.9 + 0.1 * min(1.0, world.opening / world.gripper.most)
+            return (
+                1.0
+                if _hand_is_away(world)
+                else 0.9 + 0.1 * min(1.0, world.opening / world.gripper.most)
+            )
         if is_held(world, TOP):
             return 0.5 + 0.4 * carry_progress(world, TOP, place_on_base(world), OVER_BASE)
         return 0.45 * grasp_progress(world, TOP)

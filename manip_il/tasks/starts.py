@@ -12,23 +12,30 @@ from manip_il.sim.world import World
 from manip_il.tasks.grasp import is_cube
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # wxyz
-FROM_HAND = 0.1  # least horizontal distance from hand to object, as in gymnasium-robotics' FetchPickAndPlace [m]
+# least horizontal distance from hand to object, as in gymnasium-robotics' FetchPickAndPlace [m]
+FROM_HAND = 0.1
 FROM_HAND_SHARE = 0.75  # the same as a share of the workspace's half width, if that is less
-LIFT_HEIGHT = 0.45  # workspace height from which the full `LIFT` is used; lower workspaces scale it down [m]
+# workspace height from which the full `LIFT` is used; lower workspaces scale it down [m]
+LIFT_HEIGHT = 0.45
 IN_AIR = 0.5  # share of goals above the table, as in FetchPickAndPlace
 LIFT = (0.1, 0.25)  # height of a goal above the object's start [m]
 FEW_DRAWS = 50  # draws of one place before the other places are drawn again, too
 _MOST_DRAWS = 1_000
-_BOX, _SPHERE, _CAPSULE = (int(kind) for kind in (mjtGeom.mjGEOM_BOX, mjtGeom.mjGEOM_SPHERE, mjtGeom.mjGEOM_CAPSULE))
+_BOX, _SPHERE, _CAPSULE = (
+    int(kind) for kind in (mjtGeom.mjGEOM_BOX, mjtGeom.mjGEOM_SPHERE, mjtGeom.mjGEOM_CAPSULE)
+)
 _HALF = np.sqrt(0.5)
-_UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.0]), UPRIGHT)  # turn x, y or z up
+# turn x, y or z up
+_UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.0]), UPRIGHT)
 
 
 def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, F64]:
-    """Draw a pose of an object at rest, its side, place and yaw: position (3,) [m] and quaternion wxyz (4,).
+    """Draw a pose of an object at rest, its side, place and yaw: position (3,) [m] and quaternion
+    wxyz (4,).
 
-    Sides that look alike count once. A capsule lies on its side; a mesh rests as modelled or, if it cannot, on the side
-    nearest to its modelled underside. A cube's yaw is within +-pi/4, as its faces are alike.
+    Sides that look alike count once. A capsule lies on its side; a mesh rests as modelled or, if it
+    cannot, on the side nearest to its modelled underside. A cube's yaw is within +-pi/4, as its
+    faces are alike.
     """
     lengths = world.extents(name)
     if (hull := world.hull(name)) is not None:
@@ -53,34 +60,53 @@ def _sides(kind: int, lengths: Sequence[float]) -> list[int]:
     """Axes (0 to 2) that may point up when the object rests; axes of the same length count once."""
     if kind in (_SPHERE, _CAPSULE):
         return [0]
-    return [axis for axis in range(3) if lengths[axis] not in lengths[:axis] or (kind != _BOX and axis == 2)]
+    return [
+        axis
+        for axis in range(3)
+        if lengths[axis] not in lengths[:axis] or (kind != _BOX and axis == 2)
+    ]
 
 
 def draw_resting(rng: np.random.Generator, world: World, name: str, room: float = 0.0) -> F64:
-    """Draw a resting place of an object's centre, (3,) [m], not under the hand; room: see `draw_resting_place`."""
+    """Draw a resting place of an object's centre, (3,) [m], not under the hand.
+
+    room: see `draw_resting_place`.
+    """
     return draw_resting_place(rng, world, name, resting_height(world, name), room)
 
 
-def draw_resting_place(rng: np.random.Generator, world: World, name: str, height: float, room: float = 0.0) -> F64:
-    """Draw a place at a height over the table, (3,) [m], within reach and away from the hand's start.
+def draw_resting_place(
+    rng: np.random.Generator, world: World, name: str, height: float, room: float = 0.0
+) -> F64:
+    """Draw a place at a height over the table, (3,) [m], within reach and away from the hand's
+    start.
 
-    room: margin around the place [m] that must also be within reach, so that a knocked object stays within reach.
+    room: margin around the place [m] that must also be within reach, so that a knocked object stays
+    within reach.
     """
     space = world.robot.workspace
     centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
 
     def fits(at: F64) -> bool:
         around = ((0, 0, 0), (room, 0, 0), (-room, 0, 0), (0, room, 0), (0, -room, 0))
-        return bool(np.linalg.norm(at[:2] - centre) >= apart) and all(world.reach.has(at + way) for way in around)
+        return bool(np.linalg.norm(at[:2] - centre) >= apart) and all(
+            world.reach.has(at + way) for way in around
+        )
 
     return draw_until(lambda: np.append(draw_xy(rng, world), height), fits, world, name)
 
 
 def draw_goal(rng: np.random.Generator, world: World, height: float, in_air: float = IN_AIR) -> F64:
-    """Draw a goal at `height` over the table or, with probability `in_air`, anywhere above that; (3,) [m]."""
+    """Draw a goal at `height` over the table or, with probability `in_air`, anywhere above that.
+
+    (3,) [m].
+    """
     top = world.robot.workspace.height if rng.uniform() < in_air else 0.0
     return draw_until(
-        lambda: np.append(draw_xy(rng, world), height + rng.uniform(0, top)), world.reach.has, world, "the goal"
+        lambda: np.append(draw_xy(rng, world), height + rng.uniform(0, top)),
+        world.reach.has,
+        world,
+        "the goal",
     )
 
 
@@ -108,15 +134,20 @@ def draw_until[T](draw: Callable[[], T], fits: Callable[[T], bool], world: World
         if fits(drawn):
             return drawn
     raise UsageError(
-        f"task {world.scene.task.name}: none of {_MOST_DRAWS} places drawn for {what} fits within reach of"
-        f" {world.robot.name}; choose another task or robot"
+        f"task {world.scene.task.name}: none of {_MOST_DRAWS} places drawn for {what} fits within"
+        f" reach of {world.robot.name}; choose another task or robot"
     )
 
 
 def draw_together(
-    draw: Callable[[str], F64], names: Iterable[str], fits: Callable[[F64, Sequence[F64]], bool], world: World
+    draw: Callable[[str], F64],
+    names: Iterable[str],
+    fits: Callable[[F64, Sequence[F64]], bool],
+    world: World,
 ) -> list[F64]:
-    """For each name draw a place (3,) [m] that fits the earlier places; if none is found, draw all places again.
+    """For each name draw a place (3,) [m] that fits the earlier places.
+
+    If none is found, draw all places again.
 
     Raises `UsageError` after a thousand attempts.
     """

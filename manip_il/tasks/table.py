@@ -1,7 +1,8 @@
-"""Tasks by name: those that ship, a user's Python file, or a name that an installed package provides.
+"""Tasks by name: those that ship, a user's Python file, or a name that an installed package
+provides.
 
-A file runs only if the user gives its `Path`, never because a dataset, a checkpoint or a result names its task: what
-these store is a `str`, which is a name.
+A file runs only if the user gives its `Path`, never because a dataset, a checkpoint or a result
+names its task: what these store is a `str`, which is a name.
 """
 
 import hashlib
@@ -51,12 +52,14 @@ def get_task(name: NameOrPath, shape: NameOrPath = "") -> Task:
     """Return a task by its name, `NAME` or `NAME:ARGUMENT`, or from a file of the user's own.
 
     Args:
-        name: A name or, as `option.typed` returns it, the `Path` of a Python file, or of a `carry:reward.json`.
+        name: A name or, as `option.typed` returns it, the `Path` of a Python file, or of a
+            `carry:reward.json`.
         shape: The object's, as `ObjectShape.parse` reads it; empty for the task's default.
 
     Raises:
         UnknownName: if no task has this name.
-        UsageError: for a file without a task, or an argument or a shape that is invalid or that the task does not take.
+        UsageError: for a file without a task, or an argument or a shape that is invalid or that the
+            task does not take.
     """
     if isinstance(name, Path) and name.suffix == SUFFIX:
         task = _of_file(name.absolute())
@@ -74,7 +77,10 @@ def _shaped(task: Task, shape: NameOrPath) -> Task:
 
 
 def is_task(name: str) -> bool:
-    """Return whether a task ships or an installed package provides it; the task's code is not run."""
+    """Return whether a task ships or an installed package provides it.
+
+    The task's code is not run.
+    """
     base = name.partition(":")[0]
     return base in TASKS or _entry_point(base) is not None
 
@@ -94,7 +100,9 @@ def _named(name: str) -> Task:
     try:
         cls = entry.load()
     except Exception as error:
-        raise UsageError(f"{name} of {entry.value} cannot be imported: {checks.one_line(error)}") from error
+        raise UsageError(
+            f"{name} of {entry.value} cannot be imported: {checks.one_line(error)}"
+        ) from error
     return _made(f"task {name} of {entry.value}", cls)
 
 
@@ -117,15 +125,22 @@ def _of_file(path: Path) -> Task:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[name]
-        raise UsageError(f"{path} cannot be run: {type(error).__name__}: {checks.one_line(error)}") from error
+        raise UsageError(
+            f"{path} cannot be run: {type(error).__name__}: {checks.one_line(error)}"
+        ) from error
     own = [one for one in vars(module).values() if inspect.isclass(one) and one.__module__ == name]
     tasks = [cls for cls in own if issubclass(cls, Task) and not cls.__name__.startswith("_")]
     if len(tasks) != 1:
         found = ", ".join(one.__name__ for one in tasks) or "none"
-        raise UsageError(f"tasks in {path}: {found}; expected one subclass of manip_il.task.Task (docs/new-task.md)")
+        raise UsageError(
+            f"tasks in {path}: {found}; expected one subclass of manip_il.task.Task"
+            " (docs/new-task.md)"
+        )
     task = _made(f"{path}: task {tasks[0].__name__}", tasks[0])
     if task.name in TASKS:
-        raise UsageError(f"{path}: its task has a built-in task's name, {task.name!r}; choose another")
+        raise UsageError(
+            f"{path}: its task has a built-in task's name, {task.name!r}; choose another"
+        )
     return task
 
 

@@ -47,10 +47,9 @@ TASK_HELP = (
 class EnvConfig(Episodes):
     """Settings of one environment; every field is part of the fingerprint.
 
-    robot, task: a name, or the `Path` of a user's own file. object: shape and size of what is grasped,
-    as `ObjectShape.parse` reads it, or the `Path` of a mesh; empty for the task's default. A name that
-    was stored is a `str`, which no code
-    takes for a path.
+    robot, task: a name, or the `Path` of a user's own file. object: shape and size of what is
+    grasped, as `ObjectShape.parse` reads it, or the `Path` of a mesh; empty for the task's default.
+    A name that was stored is a `str`, which no code takes for a path.
     """
 
     robot: NameOrPath = option("panda", ROBOT_HELP, flag="robot.type")
@@ -59,5 +58,7 @@ class EnvConfig(Episodes):
 
     @property
     def name(self) -> str:
-        """Robot and task joined by "_": a file by its name without the suffix, a task without its argument."""
+        """Robot and task joined by "_": a file by its name without the suffix, a task without
+        its argument.
+        """
         return f"{Path(self.robot).stem}_{Path(self.task).stem.partition(':')[0]}"

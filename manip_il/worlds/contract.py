@@ -1,6 +1,8 @@
-"""The contract of a world, whoever made it: an environment, an expert, and how they are made from names.
+"""The contract of a world, whoever made it: an environment, an expert, and how they are made from
+names.
 
-A world gives its environments and experts as these classes say; what it cannot do stands in its `EnvironmentSpec`.
+A world gives its environments and experts as these classes say; what it cannot do stands in its
+`EnvironmentSpec`.
 """
 
 from __future__ import annotations
@@ -23,19 +25,23 @@ from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.fingerprint import canonical_json
 
 OPENINGS = "joint position targets [rad], gripper opening command [m]"
-SERVOS = "joint position targets [deg], gripper position command [0 to 100]"  # as in LeRobot's recorder
+# as in LeRobot's recorder
+SERVOS = "joint position targets [deg], gripper position command [0 to 100]"
 TWO_ARMS = "joint position targets [rad], gripper command [0 to 1], of two arms"
 JOINT_TARGETS = (OPENINGS, SERVOS, TWO_ARMS)
-GRIPPERS = {TWO_ARMS: (6, 13)}  # action meaning -> indices of the grippers in state and action; by default the last
-VERSION = 2  # version of the columns and their meaning: 2 has progress, complete states and named phases
-_OPTIONAL = ("object", "robot_type", "video", "keypoints")  # keys of a spec's JSON that may be missing
+# action meaning -> indices of the grippers in state and action; by default the last
+GRIPPERS = {TWO_ARMS: (6, 13)}
+# version of the columns and their meaning: 2 has progress, complete states and named phases
+VERSION = 2
+# keys of a spec's JSON that may be missing
+_OPTIONAL = ("object", "robot_type", "video", "keypoints")
 
 Ability = Literal["restored", "varied", "redrawn", "perturbed", "drawn", "shown in a window"]
 """What can be done with an environment.
 
-`restored`: its states, so that they can be labelled and drawn again. `varied`: its physics, appearance and noise, by
-`Condition`. `redrawn`: new scenes from visited states. `perturbed`: its objects moved by `robot certify`. `drawn`: by
-cameras. `shown in a window`: in MuJoCo's viewer.
+`restored`: its states, so that they can be labelled and drawn again. `varied`: its physics,
+appearance and noise, by `Condition`. `redrawn`: new scenes from visited states. `perturbed`: its
+objects moved by `robot certify`. `drawn`: by cameras. `shown in a window`: in MuJoCo's viewer.
 """
 
 
@@ -45,7 +51,8 @@ def _not_stored(default: Any) -> Any:
 
 @dataclass(frozen=True)
 class EnvironmentSpec:
-    """Names, sizes and rate that a dataset, a policy and an environment must share, and what an environment can do.
+    """Names, sizes and rate that a dataset, a policy and an environment must share, and what an
+    environment can do.
 
     Names of robot, task and cameras are safe in paths. Raises `ManipError` naming an invalid value.
     """
@@ -60,22 +67,29 @@ class EnvironmentSpec:
 
     action_meaning: str = OPENINGS
     cameras: tuple[str, ...] = ()
-    image_size: tuple[int, int] = (0, 0)  # height, width [pixels] of every camera; (0, 0) without cameras
-    phases: tuple[str, ...] = ()  # name of each value of `expert_phase`: "none", then the rungs of the task's ladder
+    # height, width [pixels] of every camera; (0, 0) without cameras
+    image_size: tuple[int, int] = (0, 0)
+    # name of each value of `expert_phase`: "none", then the rungs of the task's ladder
+    phases: tuple[str, ...] = ()
     object: str = ""  # shape and size of the object that the task moves; empty for the task's own
     robot_type: str = ""  # LeRobot's name of the robot; empty if the same as `robot`
-    video: bool = True  # whether pictures are in video files; otherwise they are PNGs in the data files
-    keypoints: tuple[str, ...] = ()  # points of the scene whose image coordinates are columns, for every camera
+    # whether pictures are in video files; otherwise they are PNGs in the data files
+    video: bool = True
+    # points of the scene whose image coordinates are columns, for every camera
+    keypoints: tuple[str, ...] = ()
     schema: int = VERSION
 
     # Of an environment alone: neither stored in datasets and checkpoints, nor compared
     horizon: int = _not_stored(0)  # most control steps of an episode
     can: tuple[Ability, ...] = _not_stored(())
     all_cameras: tuple[str, ...] = _not_stored(())  # names of the cameras that can draw it
-    default_cameras: tuple[str, ...] = _not_stored(())  # those that draw it if none are named; the first one films
+    # those that draw it if none are named; the first one films
+    default_cameras: tuple[str, ...] = _not_stored(())
     points: tuple[str, ...] = _not_stored(())  # keypoints that cameras would see
-    ends_solved: bool | None = _not_stored(None)  # whether it ends solved episodes by itself; None: as the caller asks
-    shares_model: bool = _not_stored(True)  # whether environments in one process share one compiled model
+    # whether it ends solved episodes by itself; None: as the caller asks
+    ends_solved: bool | None = _not_stored(None)
+    # whether environments in one process share one compiled model
+    shares_model: bool = _not_stored(True)
 
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
@@ -88,19 +102,33 @@ class EnvironmentSpec:
     def to_json(self) -> dict[str, Any]:
         """Return the stored fields as JSON types, without optional keys that have their default."""
         values = {one.name: getattr(self, one.name) for one in fields(self) if one.compare}
-        values = {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
-        values |= {"video": None if self.video else False, "keypoints": list(self.keypoints) or None}
-        return {key: value for key, value in values.items() if value not in ("", None) or key not in _OPTIONAL}
+        values = {
+            key: list(value) if isinstance(value, tuple) else value for key, value in values.items()
+        }
+        values |= {
+            "video": None if self.video else False,
+            "keypoints": list(self.keypoints) or None,
+        }
+        return {
+            key: value
+            for key, value in values.items()
+            if value not in ("", None) or key not in _OPTIONAL
+        }
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EnvironmentSpec:
-        """Return the spec that `to_json` wrote. Raises `ManipError` for an older schema, `TypeError` for other keys."""
+        """Return the spec that `to_json` wrote.
+
+        Raises `ManipError` for an older schema, `TypeError` for other keys.
+        """
         if (found := data.get("schema", 1)) != VERSION:
             raise ManipError(
-                f"written with schema {checks.shorten(found)} of manip_il's columns, but this version reads {VERSION}; "
-                "make it again in another folder, with the same options"
+                f"written with schema {checks.shorten(found)} of manip_il's columns, but this"
+                f" version reads {VERSION}; make it again in another folder, with the same options"
             )
-        values: dict[str, Any] = {key: tuple(one) if isinstance(one, list) else one for key, one in data.items()}
+        values: dict[str, Any] = {
+            key: tuple(one) if isinstance(one, list) else one for key, one in data.items()
+        }
         return cls(**values)
 
     @property
@@ -119,7 +147,9 @@ class EnvironmentSpec:
             raise Unable(f"{self.robot} cannot be {ability}; {advice}")
 
     def require_cameras(self, cameras: CameraConfig | None) -> None:
-        """Raise `Unable` if no camera can draw the environment, `UnknownName` for a camera that it does not have."""
+        """Raise `Unable` if no camera can draw the environment, `UnknownName` for a camera that
+        it does not have.
+        """
         if cameras is not None:
             self.require("drawn", f"omit --cameras={','.join(cameras.names)}")
             require_cameras(cameras, self.all_cameras)
@@ -135,7 +165,8 @@ class Unable(UsageError):
 
 
 class Outcome(NamedTuple):
-    """What one control step did: the action as executed, before clipping (n,), its reward, and success after it.
+    """What one control step did: the action as executed, before clipping (n,), its reward, and
+    success after it.
 
     `executed` is the given array itself unless the environment changed it.
     """
@@ -184,15 +215,22 @@ class Environment(Protocol):
         ...
 
     def positions(self) -> dict[str, F64]:
-        """Return true positions (3,) [m] of `hand` and objects, of which the first one to reach is called `object`."""
+        """Return true positions (3,) [m] of `hand` and objects, of which the first one to reach
+        is called `object`.
+        """
         ...
 
     def varied(self, state: State, drawn: Mapping[str, Any]) -> State:
-        """Return a state with other values of what `Condition` draws, if the environment can be `varied`."""
+        """Return a state with other values of what `Condition` draws, if the environment can be
+        `varied`.
+        """
         return state
 
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
-        """Return a new scene made from a state, if it can be `redrawn`; None if the drawn places overlap."""
+        """Return a new scene made from a state, if it can be `redrawn`.
+
+        None if the drawn places overlap.
+        """
         return None
 
 
@@ -200,7 +238,9 @@ class Expert(Protocol):
     """Labels any state; the same state gives bit-equal labels in any order and process."""
 
     def label(self, state: State, environment: Environment | None = None) -> Label:
-        """Return the expert's action (n,) in a state. Raises `MismatchError` for a state of another scene.
+        """Return the expert's action (n,) in a state.
+
+        Raises `MismatchError` for a state of another scene.
 
         environment: one that is already in this state; it is only read.
         """
@@ -230,14 +270,19 @@ class WorldKind:
 
     def look_sha256(self, config: EnvConfig, cameras: CameraConfig) -> str:
         """Return the hash of everything else that determines its pictures."""
-        return hashlib.sha256(f"{canonical_json(cameras)} {self.drawing_version(config)}".encode()).hexdigest()
+        return hashlib.sha256(
+            f"{canonical_json(cameras)} {self.drawing_version(config)}".encode()
+        ).hexdigest()
 
     def drawing_version(self, config: EnvConfig) -> int:
         """Return a number that changes when pictures do."""
         raise NotImplementedError
 
     def own_files(self, robot: str, task: str, shape: str) -> list[str]:
-        """Return the options, with FILE for a path, that name what is not built in; [] if everything is."""
+        """Return the options, with FILE for a path, that name what is not built in.
+
+        [] if everything is.
+        """
         return []
 
     def lerobot_words(self, robot: str, task: str) -> list[str]:
@@ -245,9 +290,15 @@ class WorldKind:
         return []
 
     def success(self, tolerance: float, steps: int) -> str:
-        """Return in words when an episode is a success. tolerance: [m]; steps: control steps within it."""
+        """Return in words when an episode is a success. tolerance: [m].
+
+        steps: control steps within it.
+        """
         return "as the environment itself reports it"
 
     def affecting(self, config: EnvConfig, condition: Condition, *, sees: bool) -> Condition | None:
-        """Return the part of a condition that changes something; None if nothing does. sees: with cameras."""
+        """Return the part of a condition that changes something.
+
+        None if nothing does. sees: with cameras.
+        """
         return None if condition.ranges else condition

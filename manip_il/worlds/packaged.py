@@ -1,4 +1,6 @@
-"""What environments of other packages share: they run unmodified, and MuJoCo's state restores them."""
+"""What environments of other packages share: they run unmodified, and MuJoCo's state restores
+them.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -15,7 +17,14 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.props import VERSION as DRAWN
 from manip_il.worlds.config import WORLDS, EnvConfig
-from manip_il.worlds.contract import Ability, Environment, EnvironmentSpec, Expert, Outcome, WorldKind
+from manip_il.worlds.contract import (
+    Ability,
+    Environment,
+    EnvironmentSpec,
+    Expert,
+    Outcome,
+    WorldKind,
+)
 from manip_il.worlds.fingerprint import environment_fingerprint
 from manip_il.worlds.table import described_env
 
@@ -24,7 +33,9 @@ TOLERANCE = 0.05  # Fetch's; another environment that reports success by itself 
 
 
 class PackagedRung(NamedTuple):
-    """A phase of an expert. holds, target: functions of what the expert reads from the state to label."""
+    """A phase of an expert. holds, target: functions of what the expert reads from the state to
+    label.
+    """
 
     name: str
     holds: Callable[[Any], bool]
@@ -109,9 +120,14 @@ class PackagedEnv(Environment):
         return physics
 
     def _restore(self, state: State, size: int) -> None:
-        """Restore the counts, if the state's physics has this many numbers; raise `MismatchError` if not."""
+        """Restore the counts, if the state's physics has this many numbers.
+
+        Raise `MismatchError` if not.
+        """
         if len(state.physics) != size:
-            raise MismatchError("size of the state", "the state", len(state.physics), self.task.name, size)
+            raise MismatchError(
+                "size of the state", "the state", len(state.physics), self.task.name, size
+            )
         self._count_from(state.step, state.streak, state.ever)
 
     def _count_from(self, step: int, streak: int, ever: bool) -> None:
@@ -121,7 +137,10 @@ class PackagedEnv(Environment):
 
 
 class Packaged(WorldKind):
-    """The environments of another package. cls: of its environments; teach: returns the expert of a task."""
+    """The environments of another package. cls: of its environments.
+
+    teach: returns the expert of a task.
+    """
 
     def __init__(self, cls: type[PackagedEnv], teach: Callable[[str], Expert]):
         self._cls, self._teach = cls, teach
@@ -133,7 +152,9 @@ class Packaged(WorldKind):
         if config.task not in self._tasks:
             raise UnknownName(f"task of {robot}", str(config.task), self._tasks)
         if config.object:
-            raise UsageError(f"object is {config.object}; {robot} is unmodified, so omit --task.object")
+            raise UsageError(
+                f"object is {config.object}; {robot} is unmodified, so omit --task.object"
+            )
         fixed = {"control_hz": self._cls.control_hz, "tolerance": TOLERANCE, "success_steps": 1}
         for name, value in fixed.items():
             given = getattr(config, name)

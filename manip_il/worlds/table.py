@@ -40,8 +40,8 @@ def make_config(
 ) -> EnvConfig:
     """Return the settings of an environment; what is not given comes from its robot and task.
 
-    This function is for what a person wrote: names that end in `.py` or `.yaml` and objects `mesh:FILE` are paths. What
-    is stored goes to `complete`, where a `str` is a name.
+    This function is for what a person wrote: names that end in `.py` or `.yaml` and objects
+    `mesh:FILE` are paths. What is stored goes to `complete`, where a `str` is a name.
 
     Args:
         robot: Its name, or the path of its YAML.
@@ -53,7 +53,11 @@ def make_config(
         UnknownName: for a robot or a task.
         UsageError: for a wrong value.
     """
-    settings |= {"robot": typed(robot), "task": typed(task), "object": typed(settings.get("object", ""))}
+    settings |= {
+        "robot": typed(robot),
+        "task": typed(task),
+        "object": typed(settings.get("object", "")),
+    }
     return complete(make_options(EnvConfig, control_hz=control_hz, **settings))
 
 
@@ -66,9 +70,14 @@ def env_of_name(env: EnvConfig | str) -> EnvConfig:
 
 
 def stored_config(
-    spec: Any, robot: NameOrPath | None = None, task: NameOrPath | None = None, shape: NameOrPath | None = None
+    spec: Any,
+    robot: NameOrPath | None = None,
+    task: NameOrPath | None = None,
+    shape: NameOrPath | None = None,
 ) -> EnvConfig:
-    """Return the settings of the environment that a dataset or a policy names; what it names is never a path.
+    """Return the settings of the environment that a dataset or a policy names.
+
+    What it names is never a path.
 
     Args:
         spec: A `EnvironmentSpec` or an `Origin`.
@@ -77,19 +86,28 @@ def stored_config(
         shape: See `robot`; the object.
 
     Raises:
-        UsageError: if something that is not built in was not given, and whatever else `make_config` raises.
+        UsageError: if something that is not built in was not given, and whatever else `make_config`
+            raises.
     """
-    named = {"robot": robot or spec.robot, "task": task or spec.task, "object": shape or spec.object}
+    named = {
+        "robot": robot or spec.robot,
+        "task": task or spec.task,
+        "object": shape or spec.object,
+    }
     return complete(replace(EnvConfig(spec.fps), **named))
 
 
 def complete(config: EnvConfig) -> EnvConfig:
-    """Return settings with 0 and empty values filled in from robot and task; raises what `make_config` raises."""
+    """Return settings with 0 and empty values filled in from robot and task.
+
+    Raises what `make_config` raises.
+    """
     check_bounds(config)
     config = world_of(config.robot).complete(config)
     if config.horizon < config.success_steps:
         raise UsageError(
-            f"horizon is {config.horizon}, success_steps {config.success_steps}; expected horizon >= success_steps"
+            f"horizon is {config.horizon}, success_steps {config.success_steps}; expected horizon"
+            " >= success_steps"
         )
     return config
 
@@ -128,7 +146,10 @@ def make_expert(config: EnvConfig) -> Expert:
 
 @cache
 def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> EnvironmentSpec:
-    """Return what a dataset or a policy for this environment must share. Raises what `make_env` raises for cameras."""
+    """Return what a dataset or a policy for this environment must share.
+
+    Raises what `make_env` raises for cameras.
+    """
     spec = described_env(config).spec
     if cameras is None:
         return spec
@@ -137,8 +158,14 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> Environm
 
 
 def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, str]:
-    """Return package versions, processor, and hashes of the compiled model and of environment and camera settings."""
-    look = {} if cameras is None else {"cameras_sha256": world_of(config.robot).look_sha256(config, cameras)}
+    """Return package versions, processor, and hashes of the compiled model and of environment
+    and camera settings.
+    """
+    look = (
+        {}
+        if cameras is None
+        else {"cameras_sha256": world_of(config.robot).look_sha256(config, cameras)}
+    )
     return _fingerprint(config) | look
 
 

@@ -39,7 +39,9 @@ def expert_only(run: Run, c: RunConfig) -> Iterator[Result]:
 
 
 def halves(run: Run, c: RunConfig) -> Iterator[Result]:
-    """Let expert and learner drive half of the steps each, and learn from the latest rollouts alone."""
+    """Let expert and learner drive half of the steps each, and learn from the latest rollouts
+    alone.
+    """
     data: Rollouts = run.demonstrations(c.demonstrations)
     for i in range(1, c.rounds + 1):
         policy = run.fit([data])
@@ -54,7 +56,9 @@ def follow(algorithm, folder: Path, watch: Progress | None = None) -> list[Resul
 
 
 @pytest.mark.parametrize(("algorithm", "betas"), [(expert_only, [1.0]), (halves, [1.0, 0.5, 0.5])])
-def test_a_new_algorithm_goes_on_where_it_was_stopped_to_the_same_bytes(algorithm, betas, tmp_path, monkeypatch):
+def test_a_new_algorithm_goes_on_where_it_was_stopped_to_the_same_bytes(
+    algorithm, betas, tmp_path, monkeypatch
+):
     whole, rounds = follow(algorithm, tmp_path / "whole"), len(betas)
     assert [result.number for result in whole] == list(range(rounds))
     assert [result.metrics["beta"] for result in whole] == betas
@@ -77,4 +81,6 @@ def test_a_new_algorithm_goes_on_where_it_was_stopped_to_the_same_bytes(algorith
 
     monkeypatch.setattr(Engine, "run", None)  # nothing is left to do
     third = follow(algorithm, tmp_path / "again")
-    assert [replace(result, seconds={}) for result in third] == [replace(result, seconds={}) for result in again]
+    assert [replace(result, seconds={}) for result in third] == [
+        replace(result, seconds={}) for result in again
+    ]

@@ -1,4 +1,6 @@
-"""Runs on a very small scale: what it leaves on disk, and that a stopped run goes on as if it had not been."""
+"""Runs on a very small scale: what it leaves on disk, and that a stopped run goes on as if it
+had not been.
+"""
 
 import json
 from dataclasses import replace
@@ -72,7 +74,9 @@ def test_the_numbers_of_a_round_are_those_of_its_data(run):
     assert [result.metrics["beta"] for result in results] == [1.0, 0.5]
     assert [result.episodes for result in results] == [4, 6]
     for result in results:
-        table = joined_columns(datasets(folder, result.number), ("observation.state", "action", "label_valid"))
+        table = joined_columns(
+            datasets(folder, result.number), ("observation.state", "action", "label_valid")
+        )
         assert result.labels == table["label_valid"].sum()
         record = result.to_json()
         assert record["validation_success"] == result.validation.success.rate
@@ -84,7 +88,9 @@ def test_the_numbers_of_a_round_are_those_of_its_data(run):
 def test_every_seed_is_from_its_own_stream(run):
     folder, _, made = run
     for round_, stream, count in ((0, "demonstrations", 4), (1, "round/1", 2)):
-        table = Dataset.open(round_folder(folder, round_) / "dataset").columns(("seed", "round", "beta"))
+        table = Dataset.open(round_folder(folder, round_) / "dataset").columns(
+            ("seed", "round", "beta")
+        )
         assert set(table["seed"].ravel()) == set(stream_seeds(stream, count))
         assert set(table["round"].ravel()) == {round_}
     seeds = {episode.seed for episode in made}
@@ -94,14 +100,21 @@ def test_every_seed_is_from_its_own_stream(run):
 
 def test_the_aggregated_dataset_holds_both_actions_and_who_drove(run):
     folder, _, _ = run
-    table = Dataset.open(folder / "dataset").columns(("action", "executed_action", "actor", "round", "episode_index"))
+    table = Dataset.open(folder / "dataset").columns(
+        ("action", "executed_action", "actor", "round", "episode_index")
+    )
     round_, actor = table["round"].ravel(), table["actor"].ravel()
     assert len(np.unique(table["episode_index"])) == 6
     np.testing.assert_array_equal(
-        table["action"], joined_columns(datasets(folder, 1), ("observation.state", "action", "label_valid"))["action"]
+        table["action"],
+        joined_columns(datasets(folder, 1), ("observation.state", "action", "label_valid"))[
+            "action"
+        ],
     )
     assert set(actor[round_ == 0]) == {Actor.EXPERT}
-    np.testing.assert_array_equal(table["action"][round_ == 0], table["executed_action"][round_ == 0])
+    np.testing.assert_array_equal(
+        table["action"][round_ == 0], table["executed_action"][round_ == 0]
+    )
     assert {Actor.LEARNER} < set(actor[round_ == 1])
     learner = actor == Actor.LEARNER
     assert (table["action"][learner] != table["executed_action"][learner]).any(axis=1).all()
@@ -118,7 +131,9 @@ def test_running_it_again_computes_nothing_anew(run, monkeypatch):
     logged: list[dict] = []
     again = list(Run(CONFIG, folder, Engine(), watching(log=logged.append)).results())
     assert logged == []
-    assert [replace(result, seconds={}) for result in again] == [replace(result, seconds={}) for result in results]
+    assert [replace(result, seconds={}) for result in again] == [
+        replace(result, seconds={}) for result in results
+    ]
     assert digests(folder) == before
 
 
@@ -126,7 +141,8 @@ class Stop(Exception):
     pass
 
 
-@pytest.mark.parametrize("episodes", [2, 5, 7])  # in the demonstrations, in round 1, in a validation
+# in the demonstrations, in round 1, in a validation
+@pytest.mark.parametrize("episodes", [2, 5, 7])
 def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episodes: int):
     whole, results, _ = run
     count = 0
@@ -141,7 +157,9 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episode
         list(Run(CONFIG, tmp_path, Engine(), watching(episode=stop)).results())
     again = list(Run(CONFIG, tmp_path, Engine()).results())
     assert [result.validation for result in again] == [result.validation for result in results]
-    assert [line["round"] for line in read_lines(tmp_path / "metrics.jsonl")] == [one.number for one in results]
+    assert [line["round"] for line in read_lines(tmp_path / "metrics.jsonl")] == [
+        one.number for one in results
+    ]
     check_same_data(tmp_path, whole)
 
 
@@ -175,16 +193,22 @@ def test_a_run_begins_with_recorded_demonstrations_in_place_of_its_own(run, tmp_
     assert not (round_folder(tmp_path / "run", 0) / "journals").exists()
     assert results[1].labels > results[0].labels
     aggregated = Dataset.open(tmp_path / "run" / "dataset").columns(("action",))["action"]
-    np.testing.assert_array_equal(aggregated[: results[0].labels], joined_columns(given, ("action",))["action"])
+    np.testing.assert_array_equal(
+        aggregated[: results[0].labels], joined_columns(given, ("action",))["action"]
+    )
     again = list(Run(config, tmp_path / "run", Engine()).results())
     assert [result.validation for result in again] == [result.validation for result in results]
 
 
 @pytest.mark.parametrize("with_data", [False, True])
-def test_a_run_begins_with_a_policy_and_goes_on_from_its_weights(run, tmp_path, begun, with_data: bool):
+def test_a_run_begins_with_a_policy_and_goes_on_from_its_weights(
+    run, tmp_path, begun, with_data: bool
+):
     folder, before, _ = run
     start = before[1].policy
-    config = replace(CONFIG, start=start, datasets=tuple(datasets(folder, 0)) if with_data else (), beta=ALONE)
+    config = replace(
+        CONFIG, start=start, datasets=tuple(datasets(folder, 0)) if with_data else (), beta=ALONE
+    )
     results = list(Run(config, tmp_path, Engine()).results())
     assert digests(results[0].policy) == digests(start)
     assert (results[0].labels > 0) == with_data
@@ -208,7 +232,9 @@ def test_a_budget_of_labels_is_kept_to_the_label_and_ends_the_run(tmp_path):
 @pytest.mark.parametrize("method", ["cloning", "dart"])
 def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path):
     results = list(Run(replace(CONFIG, method=method, beta=ALONE), tmp_path, Engine()).results())
-    table = joined_columns(datasets(tmp_path, 1), ("actor", "round", "seed", "executed_action", "action"))
+    table = joined_columns(
+        datasets(tmp_path, 1), ("actor", "round", "seed", "executed_action", "action")
+    )
     later = table["round"].ravel() == 1
     drove = {"cloning": Actor.EXPERT, "dart": Actor.NOISY_EXPERT}[method]
     assert (table["actor"].ravel()[later] == drove).all()
@@ -220,28 +246,50 @@ def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path
     assert results[1].metrics["queries"] == results[1].labels + extra
 
 
-@pytest.mark.parametrize(("label", "length"), [("per_state", None), ("takeover", None), ("branch", 4)])
-def test_a_policy_that_plans_goes_through_the_loop_with_every_kind_of_label(label, length, tmp_path):
-    config = replace(CONFIG, beta=ALONE, fit=FitConfig(ACT, steps=4, batch_size=8), label=label, refit="warm")
+@pytest.mark.parametrize(
+    ("label", "length"), [("per_state", None), ("takeover", None), ("branch", 4)]
+)
+def test_a_policy_that_plans_goes_through_the_loop_with_every_kind_of_label(
+    label, length, tmp_path
+):
+    config = replace(
+        CONFIG, beta=ALONE, fit=FitConfig(ACT, steps=4, batch_size=8), label=label, refit="warm"
+    )
     results = list(Run(config, tmp_path, Engine()).results())
     assert results[1].labels > results[0].labels
     assert json.loads((results[1].policy / "config.json").read_text())["type"] == "act"
-    table = joined_columns(datasets(tmp_path, 1), ("episode_index", "round", "actor", "label_valid"))
+    table = joined_columns(
+        datasets(tmp_path, 1), ("episode_index", "round", "actor", "label_valid")
+    )
     later = table["round"].ravel() == 1
     by_learner = table["actor"].ravel()[later] == Actor.LEARNER
     assert by_learner.all() if label == "per_state" else not by_learner.any()
     if length is not None:
-        assert set(np.unique(table["episode_index"].ravel()[later], return_counts=True)[1]) == {length}
+        assert set(np.unique(table["episode_index"].ravel()[later], return_counts=True)[1]) == {
+            length
+        }
 
 
 @pytest.mark.gl
 def test_a_blind_learner_is_taught_by_an_expert_that_sees_everything(tmp_path):
-    fit = FitConfig({"type": "cnn", "device": "cpu", "width": 16}, steps=2, batch_size=4, image_augment=False)
+    fit = FitConfig(
+        {"type": "cnn", "device": "cpu", "width": 16}, steps=2, batch_size=4, image_augment=False
+    )
     cameras, env = CameraConfig(("front",), 64, 64), make_config("panda", "reach", horizon=20)
-    config = replace(CONFIG, beta=ALONE, demonstrations=2, env=env, fit=fit, cameras=cameras, validation_episodes=1)
+    config = replace(
+        CONFIG,
+        beta=ALONE,
+        demonstrations=2,
+        env=env,
+        fit=fit,
+        cameras=cameras,
+        validation_episodes=1,
+    )
     results = list(Run(config, tmp_path, Engine()).results())
     assert results[1].labels > results[0].labels
     sees = json.loads((results[1].policy / "config.json").read_text())["input_features"]
     assert set(sees) == {"observation.state", "observation.images.front"}
     merged = Dataset.open(tmp_path / "dataset").info
-    assert merged.episodes == sum(Dataset.open(root).info.episodes for root in datasets(tmp_path, 1))
+    assert merged.episodes == sum(
+        Dataset.open(root).info.episodes for root in datasets(tmp_path, 1)
+    )

@@ -1,4 +1,6 @@
-"""A point that is to come to a place: an environment of one number, and what a learner on it is made of."""
+"""A point that is to come to a place: an environment of one number, and what a learner on it is
+made of.
+"""
 
 import numpy as np
 import torch
@@ -9,11 +11,16 @@ from manip_il.chapter.ppo import Learner, seed_generators
 from manip_il.learn.network import MLPNetwork, NetworkConfig
 
 STEPS, EPISODES = 10, 8
-ACTIONS = ActionRange(*(np.array(values, np.float32) for values in ([0, 0], [0.5, 0], [-1, 0], [1, 0])))
+ACTIONS = ActionRange(
+    *(np.array(values, np.float32) for values in ([0, 0], [0.5, 0], [-1, 0], [1, 0]))
+)
 
 
 class Point:
-    """Observes its place x and the goal 0; an action moves it. It has ended once it is at the goal."""
+    """Observes its place x and the goal 0; an action moves it.
+
+    It has ended once it is at the goal.
+    """
 
     def __init__(self, ends: bool = True):
         self.ends, self.x, self.moves = ends, 0.0, 0
@@ -37,9 +44,13 @@ class Point:
 
 
 def network() -> MLPNetwork:
-    made = MLPNetwork(3, 2, NetworkConfig(width=32, depth=2, loss="gaussian", action_space="joint_target"))
+    made = MLPNetwork(
+        3, 2, NetworkConfig(width=32, depth=2, loss="gaussian", action_space="joint_target")
+    )
     names = ("mean", "scale", "low", "high")
-    made.set_statistics({f"target_{name}": torch.from_numpy(getattr(ACTIONS, name)) for name in names})
+    made.set_statistics(
+        {f"target_{name}": torch.from_numpy(getattr(ACTIONS, name)) for name in names}
+    )
     return made
 
 

@@ -1,4 +1,6 @@
-"""Discriminators: they learn who acted, their rewards prefer the expert, and the penalty bounds them."""
+"""Discriminators: they learn who acted, their rewards prefer the expert, and the penalty bounds
+them.
+"""
 
 from typing import Any
 
@@ -25,7 +27,9 @@ def rows(action: float, seed: int = 0) -> Transitions:
 
 
 def log_density(steps: Transitions, mean: float) -> np.ndarray:
-    return (-0.5 * ((steps.actions[:, 0] - mean) / 0.3) ** 2 - np.log(0.3 * np.sqrt(2 * np.pi))).astype(np.float32)
+    return (
+        -0.5 * ((steps.actions[:, 0] - mean) / 0.3) ** 2 - np.log(0.3 * np.sqrt(2 * np.pi))
+    ).astype(np.float32)
 
 
 def make(kind: str, **options):

@@ -1,4 +1,6 @@
-"""Environments in lockstep: what reaches the robot, when an episode ends, and that it depends on its seed alone."""
+"""Environments in lockstep: what reaches the robot, when an episode ends, and that it depends on
+its seed alone.
+"""
 
 import numpy as np
 import pytest
@@ -31,7 +33,9 @@ def test_a_target_reaches_the_robot_as_the_joints_it_means():
     env.start(5)
     for step in range(3):
         seen = env.observe()
-        assert np.array_equal(observed[1, :-2], np.concatenate([seen.state, seen.environment_state]))
+        assert np.array_equal(
+            observed[1, :-2], np.concatenate([seen.state, seen.environment_state])
+        )
         action = HAND.decode(up(0.02)[None], seen.state[None])[0].astype(np.float64)
         env.advance(action)
         observed = ours.step(np.stack([up(-0.01), up(0.02)]))

@@ -1,4 +1,6 @@
-"""Runs of GAIL, AIRL and of a given reward, very small: what lies on disk, and that a stopped run goes on bit-equal."""
+"""Runs of GAIL, AIRL and of a given reward, very small: what lies on disk, and that a stopped
+run goes on bit-equal.
+"""
 
 import itertools
 from dataclasses import replace
@@ -28,7 +30,13 @@ ENV = make_config("fetch", "reach")
 def config(tmp_path_factory) -> LearningConfig:
     """Options of a run on three demonstrations, of about three iterations."""
     root = tmp_path_factory.mktemp("demos") / "reach"
-    words = ["--robot.type=fetch", "--task.type=reach", "--dataset.num_episodes=3", "--workers=1", "--quiet"]
+    words = [
+        "--robot.type=fetch",
+        "--task.type=reach",
+        "--dataset.num_episodes=3",
+        "--workers=1",
+        "--quiet",
+    ]
     assert main(["record", *words, f"--dataset.root={root}"]) == 0
     return LearningConfig(
         method="gail",
@@ -49,7 +57,9 @@ def cloned(tmp_path_factory) -> Path:
 
 
 def run(config: LearningConfig, folder: Path, count: int | None = None) -> list[Result]:
-    """Run an algorithm, or go on with it, for at most so many iterations beyond what it begins with."""
+    """Run an algorithm, or go on with it, for at most so many iterations beyond what it begins
+    with.
+    """
     begun = int(config.start is not None or (folder / "checkpoints").is_dir())
     results = LearningRun(config, folder, Engine()).results()
     return list(itertools.islice(results, begun, None if count is None else begun + count))
@@ -95,12 +105,17 @@ def test_a_finished_run_has_nothing_left_to_do_and_may_take_more_steps(config, t
 
 def test_until_the_warm_up_is_over_a_clone_acts_as_it_did(config, cloned, tmp_path):
     config = replace(config, start=cloned, warmup=2, validation_every=10**6)
-    second, third = run(config, tmp_path / "warm", count=2)[-1], run(config, tmp_path / "moved", count=3)[-1]
+    second, third = (
+        run(config, tmp_path / "warm", count=2)[-1],
+        run(config, tmp_path / "moved", count=3)[-1],
+    )
     assert second.policy != third.policy
     rng = np.random.default_rng(0)
     k = LearnedPolicy.load(cloned).checkpoint.numbers["observation.environment_state"]
     seen = rng.normal(size=(5, 8)).astype(np.float32), rng.normal(size=(5, k)).astype(np.float32)
-    before, warm, moved = (LearnedPolicy.load(one).act(*seen) for one in (cloned, second.policy, third.policy))
+    before, warm, moved = (
+        LearnedPolicy.load(one).act(*seen) for one in (cloned, second.policy, third.policy)
+    )
     assert np.array_equal(before, warm)
     assert not np.array_equal(before, moved)
     assert list(validations(tmp_path / "warm")) == [0], "the clone itself"

@@ -1,4 +1,6 @@
-"""PPO over the mlp's network: the density is the network's, the absorbing state teaches nothing, runs go on."""
+"""PPO over the mlp's network: the density is the network's, the absorbing state teaches nothing,
+runs go on.
+"""
 
 import numpy as np
 import torch
@@ -29,7 +31,10 @@ def test_the_density_is_that_of_the_policy_network_above_its_mean():
     raw = torch.from_numpy(one.env.range.raw(actions))
     with torch.no_grad():
         mean = one.policy.actor.layers(one.policy.actor.encode(torch.from_numpy(states[:, :3])))
-        theirs, still = -one.policy.actor.head.nll(mean, one.policy.actor.encode_targets(raw)), mean[:, 1]
+        theirs, still = (
+            -one.policy.actor.head.nll(mean, one.policy.actor.encode_targets(raw)),
+            mean[:, 1],
+        )
         spread = one.policy.log_std[0]
         constant = -0.5 * (still / spread.exp()) ** 2 - spread - 0.5 * np.log(2 * np.pi)
     assert len(one.policy.log_std) == 1, "the number that never changes is left out"
@@ -50,7 +55,9 @@ def test_in_the_absorbing_state_every_action_is_as_likely():
     one = learner()
     states = np.zeros((2, 4), np.float32)
     states[:, -1] = 1.0
-    assert one.log_prob(Transitions(states, np.array([[0, 0], [2, 0]], np.float32), states)).tolist() == [0, 0]
+    assert one.log_prob(
+        Transitions(states, np.array([[0, 0], [2, 0]], np.float32), states)
+    ).tolist() == [0, 0]
 
 
 def test_an_episode_that_has_ended_goes_on_in_the_absorbing_state_to_its_last_step():
@@ -78,10 +85,16 @@ def test_while_the_actor_rests_only_the_critic_learns():
     one = learner()
     before = weights(one)
     iterate(one, 0, actor=False)
-    changed = {name.split(".")[0] for name, value in weights(one).items() if not torch.equal(value, before[name])}
+    changed = {
+        name.split(".")[0]
+        for name, value in weights(one).items()
+        if not torch.equal(value, before[name])
+    }
     assert changed == {"critic"}
     iterate(one, 1)
-    assert not torch.equal(one.policy.state_dict()["actor.layers.0.weight"], before["actor.layers.0.weight"])
+    assert not torch.equal(
+        one.policy.state_dict()["actor.layers.0.weight"], before["actor.layers.0.weight"]
+    )
 
 
 def test_what_was_saved_goes_on_to_the_same_bits(tmp_path):
@@ -92,4 +105,6 @@ def test_what_was_saved_goes_on_to_the_same_bits(tmp_path):
     other = learner(seed=5)
     load_modules({"learner": other.policy}, tmp_path)
     iterate(other, 1)
-    assert all(torch.equal(value, other.policy.state_dict()[name]) for name, value in weights(one).items())
+    assert all(
+        torch.equal(value, other.policy.state_dict()[name]) for name, value in weights(one).items()
+    )

@@ -47,7 +47,9 @@ def read(monkeypatch):
         table["actor"] = np.full(EPISODES * LENGTH, Actor.EXPERT)
         table["next.success"] = np.tile(np.arange(LENGTH) >= LENGTH - 5, EPISODES)
         table |= {name.replace("__", "."): value for name, value in changes.items()}
-        monkeypatch.setattr(episodes, "joined_columns", lambda roots, names: {name: table[name] for name in names})
+        monkeypatch.setattr(
+            episodes, "joined_columns", lambda roots, names: {name: table[name] for name in names}
+        )
         return read_demonstrations([Path("demos")], lambda actions, states: actions - states)
 
     return run

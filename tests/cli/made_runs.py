@@ -28,7 +28,11 @@ SUCCESSES = (0.2, 0.6, 0.4)
 
 def files(root: Path) -> dict[str, bytes]:
     """Content of every file by its path in `root`."""
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(root)): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
 
 
 def make_episode(spec: EnvironmentSpec, seed: int, length: int) -> Episode:
@@ -57,30 +61,46 @@ def mark(policy: Path, words: str) -> Path:
 
 
 def make_run(
-    folder: Path, policy: Path, seed: int = 0, successes: tuple[float, ...] = SUCCESSES, labels: int = 100
+    folder: Path,
+    policy: Path,
+    seed: int = 0,
+    successes: tuple[float, ...] = SUCCESSES,
+    labels: int = 100,
 ) -> Path:
     """A finished run of as many rounds as successes, each with a policy of its own."""
     folder.mkdir(parents=True, exist_ok=True)
     settings = {"seed": seed, "rounds": len(successes) - 1}
     save_options(folder, replace(OPTIONS, settings=settings, output_dir=folder))
     for number, success in enumerate(successes):
-        made = folder / f"round_{number:03d}" / "policy" / "checkpoints" / "last" / "pretrained_model"
+        made = (
+            folder / f"round_{number:03d}" / "policy" / "checkpoints" / "last" / "pretrained_model"
+        )
         shutil.copytree(policy, made)
         mark(made, f"{folder} {number}")
-        record = {"round": number, "labels": labels * (number + 1), "episodes": 2 * (number + 1), "beta": 0.0}
+        record = {
+            "round": number,
+            "labels": labels * (number + 1),
+            "episodes": 2 * (number + 1),
+            "beta": 0.0,
+        }
         record |= {"validation_success": success, "validation_episodes": 10}
         make_eval(folder / f"round_{number:03d}" / "eval.json", [success > 0.5] * 2, seed=3_000_000)
         append_line(
-            folder / "metrics.jsonl", record | {"seconds": {"collect": 1.0, "fit": labels / 100, "validate": 5.0}}
+            folder / "metrics.jsonl",
+            record | {"seconds": {"collect": 1.0, "fit": labels / 100, "validate": 5.0}},
         )
     shutil.copytree(policy, folder / "best" / "pretrained_model")
     (folder / "report.html").write_text("")
     return folder
 
 
-def make_eval(path: Path, outcomes: list[bool], seed: int = 4_000_000, horizon: int = 8, task: str = "reach") -> Path:
+def make_eval(
+    path: Path, outcomes: list[bool], seed: int = 4_000_000, horizon: int = 8, task: str = "reach"
+) -> Path:
     """An evaluation with these outcomes."""
     episodes = tuple(EpisodeResult(seed + i, good, good, 8, 0.0) for i, good in enumerate(outcomes))
     settings = EvalSettings(horizon, ENV.tolerance, hold=HOLD)
-    EvalResult(path.parent.name, "panda", task, env_fingerprint(ENV), episodes, settings).write(path)
+    EvalResult(path.parent.name, "panda", task, env_fingerprint(ENV), episodes, settings).write(
+        path
+    )
     return path

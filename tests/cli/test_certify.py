@@ -1,4 +1,7 @@
-"""`manip-il robot certify` writes what it measured and prints it; what cannot be is one line before the first step."""
+"""`manip-il robot certify` writes what it measured and prints it.
+
+What cannot be is one line before the first step.
+"""
 
 import json
 
@@ -6,7 +9,15 @@ from manip_il.cli.main import main
 from manip_il.worlds.table import env_fingerprint, make_config
 
 ENV = make_config("fetch", "reach", horizon=60)
-WORDS = ["robot", "certify", "--robot.type=fetch", "--task.type=reach", "--env.horizon=60", "--cases=2", "--workers=1"]
+WORDS = [
+    "robot",
+    "certify",
+    "--robot.type=fetch",
+    "--task.type=reach",
+    "--env.horizon=60",
+    "--cases=2",
+    "--workers=1",
+]
 
 
 def test_the_file_and_the_tables_say_the_same(tmp_path, capsys):

@@ -33,7 +33,13 @@ TINY_DAGGER = [
 
 
 def record(root: Path, episodes: int, *words: str) -> list[str]:
-    return ["record", f"--dataset.root={root}", f"--dataset.num_episodes={episodes}", "--workers=1", *words]
+    return [
+        "record",
+        f"--dataset.root={root}",
+        f"--dataset.num_episodes={episodes}",
+        "--workers=1",
+        *words,
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -46,12 +52,20 @@ def demos(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def policy(demos, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "t"
-    words = ["train", f"--dataset.root={demos}", "--steps=20", "--policy.width=16", f"--output_dir={folder}"]
+    words = [
+        "train",
+        f"--dataset.root={demos}",
+        "--steps=20",
+        "--policy.width=16",
+        f"--output_dir={folder}",
+    ]
     assert main(words) == 0
     return folder
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.stem
+)
 def test_a_config_loads_by_the_command_in_its_first_line(path):
     command = path.read_text().splitlines()[0].removeprefix("# ").split()
     assert command[0] == "manip-il"
@@ -94,7 +108,13 @@ def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
 
 
 def test_train_to_eval(policy, tmp_path, capsys, error):
-    words = ["eval", f"--policy.path={policy}", "--eval.n_episodes=2", "--workers=1", "--eval.films=0"]
+    words = [
+        "eval",
+        f"--policy.path={policy}",
+        "--eval.n_episodes=2",
+        "--workers=1",
+        "--eval.films=0",
+    ]
     words += [f"--output_dir={tmp_path / 'e'}"]
     assert main(words) == 0
     out, err = capsys.readouterr()
@@ -102,7 +122,11 @@ def test_train_to_eval(policy, tmp_path, capsys, error):
     assert "--replay=4000000" in out
     result = EvalResult.read(tmp_path / "e" / "eval.json")
     assert [episode.seed for episode in result.episodes] == [4_000_000, 4_000_001]
-    assert (result.robot, result.task, result.settings.disturbance) == ("panda", "pick_place", "none")
+    assert (result.robot, result.task, result.settings.disturbance) == (
+        "panda",
+        "pick_place",
+        "none",
+    )
     assert main([*words, "--overwrite=true", "--env.tolerance=0.05", "--suite=knocked"]) == 0
     assert "config_sha256 differs" in capsys.readouterr().err
     assert "noise" in EvalResult.read(tmp_path / "e").settings.disturbance
@@ -115,7 +139,12 @@ def test_a_dagger_run_may_have_more_rounds_and_no_other_options(tmp_path, error)
     run = tmp_path / "run"
     words = ["dagger", *TINY_DAGGER, f"--output_dir={run}"]
     assert main(words) == 0
-    for name in ("config.yaml", "fingerprint.json", "report.html", "best/pretrained_model/model.safetensors"):
+    for name in (
+        "config.yaml",
+        "fingerprint.json",
+        "report.html",
+        "best/pretrained_model/model.safetensors",
+    ):
         assert (run / name).is_file()
     assert main([*words, "--resume=true", "--beta=constant:0.5"]) == 1
     assert "--beta differs" in error()

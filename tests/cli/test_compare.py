@@ -1,4 +1,7 @@
-"""Two sides of any kind meet on the same episodes; what is measured is not measured again; bad input is one line."""
+"""Two sides of any kind meet on the same episodes; what is measured is not measured again.
+
+Bad input is one line.
+"""
 
 import json
 import shutil
@@ -60,7 +63,9 @@ def test_of_a_run_the_rule_takes_the_round(here, policy, capsys):
     assert chosen() == [1, 3]
 
 
-def test_what_is_measured_is_not_measured_again_unless_the_policy_is_another(here, policy, evaluated, capsys, error):
+def test_what_is_measured_is_not_measured_again_unless_the_policy_is_another(
+    here, policy, evaluated, capsys, error
+):
     make_run(here / "a", policy)
     make_run(here / "b", policy)
     assert compare("a", "b", *SIZES) == 0
@@ -113,14 +118,28 @@ def sides(here: Path, policy: Path) -> None:
     ("words", "code", "line"),
     [
         (["run", "other_seeds"], 2, "training seeds differ: run has [None], other_seeds [5, 6]"),
-        (["two", "three"], 1, "test episodes of two and three differ; evaluate both with the same --seed"),
+        (
+            ["two", "three"],
+            1,
+            "test episodes of two and three differ; evaluate both with the same --seed",
+        ),
         (["two", "lift"], 1, "task differs: two has reach, lift has lift"),
-        (["two", "two", "--suite=knocked"], 2, "options of suite change nothing for two evaluations"),
-        (["three", "run"], 2, "only one of them is an evaluation; give two eval.json, or two policies"),
+        (
+            ["two", "two", "--suite=knocked"],
+            2,
+            "options of suite change nothing for two evaluations",
+        ),
+        (
+            ["three", "run"],
+            2,
+            "only one of them is an evaluation; give two eval.json, or two policies",
+        ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_bad_input_is_one_line_before_any_episode(words, code, line, here, policy, evaluated, error):
+def test_bad_input_is_one_line_before_any_episode(
+    words, code, line, here, policy, evaluated, error
+):
     sides(here, policy)
     assert compare(*words) == code
     assert line in error()

@@ -37,7 +37,10 @@ def test_an_error_exits_1_and_a_warning_0(root, capsys, monkeypatch):
     (root / "images").mkdir()
     (root / "images" / "x.png").write_bytes(b"x")
     assert main(["data", "check", str(root)]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"{root}: 2 episodes, 12 frames: whole; warnings: 1"
+    assert (
+        capsys.readouterr().out.splitlines()[-1]
+        == f"{root}: 2 episodes, 12 frames: whole; warnings: 1"
+    )
     edit_json(root / layout.INFO, lambda info: info.update(total_tasks=3))
     for folder in (str(root), "."):  # the current folder is a name, too
         monkeypatch.chdir(root)

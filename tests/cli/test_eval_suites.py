@@ -1,4 +1,6 @@
-"""Suites, stopping by width, parts and their merge, resuming, and replaying one line of eval.json."""
+"""Suites, stopping by width, parts and their merge, resuming, and replaying one line of
+eval.json.
+"""
 
 import base64
 import json
@@ -36,14 +38,27 @@ def evaluate(folder: str, *words: str) -> int:
 def test_the_shipped_suites_are_sound_and_all_is_all_of_them():
     for suite in SUITES:
         assert suite_conditions(suite, make_config(task="pick_place"), sees=True)
-    assert {name for names in SUITES.values() for name in names} == {*CONDITIONS} - {"random_actions"}
+    assert {name for names in SUITES.values() for name in names} == {*CONDITIONS} - {
+        "random_actions"
+    }
     assert suite_conditions("nominal", make_config(task="reach"), sees=False) == (NOMINAL,)
     [knocked] = suite_conditions("knocked", make_config(task="pick_place"), sees=False)
     assert knocked.ranges == STANDARD.ranges  # the disturbance that DAgger collects under
     names = [one.name for one in suite_conditions("all", make_config(task="pick_place"), sees=True)]
-    assert names == ["nominal", "knocked", "sensing", "late", "object", "view", "clutter", "dynamics"]
+    assert names == [
+        "nominal",
+        "knocked",
+        "sensing",
+        "late",
+        "object",
+        "view",
+        "clutter",
+        "dynamics",
+    ]
     blind = ["nominal", "knocked", "sensing", "object", "dynamics"]
-    assert [one.name for one in suite_conditions("all", make_config(task="pick_place"), sees=False)] == blind
+    assert [
+        one.name for one in suite_conditions("all", make_config(task="pick_place"), sees=False)
+    ] == blind
     assert [one.name for one in suite_conditions("all", make_config(task="reach"), sees=False)] == [
         *blind[:3],
         "dynamics",
@@ -86,7 +101,13 @@ def test_a_yaml_of_ones_own_is_a_suite(act, here, capsys, error):
 
 
 def test_until_width_stops_early(here, capsys, error):
-    words = ["--policy.type=random", "--task.type=reach", *SMALL, "--env.horizon=5", "--eval.n_episodes=300"]
+    words = [
+        "--policy.type=random",
+        "--task.type=reach",
+        *SMALL,
+        "--env.horizon=5",
+        "--eval.n_episodes=300",
+    ]
     assert evaluate("e", *words, "--until-width=0.1") == 0
     result = EvalResult.read(Path("e"))
     assert (len(result.episodes), result.until_width) == (100, 0.1)
@@ -117,7 +138,9 @@ def test_a_resumed_evaluation_is_the_whole_one(here, capsys, error):
     assert evaluate("e", *REACH, "--eval.n_episodes=4", "--resume=true") == 0
     assert Path("e/eval.json").read_bytes() == Path("whole/eval.json").read_bytes()
     assert evaluate("e", *REACH, "--eval.n_episodes=6", "--resume=true") == 0  # and more of them
-    assert [one.seed for one in EvalResult.read(Path("e")).episodes] == list(range(4_000_000, 4_000_006))
+    assert [one.seed for one in EvalResult.read(Path("e")).episodes] == list(
+        range(4_000_000, 4_000_006)
+    )
     capsys.readouterr()
     assert evaluate("e", *REACH, "--eval.n_episodes=6", "--suite=sensing", "--resume=true") == 1
     assert "--suite differs" in error()
@@ -127,10 +150,15 @@ def test_resuming_with_another_policy_of_the_same_name_is_refused(here, capsys, 
     act = write_checkpoint(here / "act", "act", env_spec(ENV))
     words = [f"--policy.path={act}", *SMALL, "--eval.n_episodes=1"]
     assert evaluate("e", *words) == 0
-    (act / "model.safetensors").write_bytes((act / "model.safetensors").read_bytes()[:-4] + b"\0\0\1\0")
+    (act / "model.safetensors").write_bytes(
+        (act / "model.safetensors").read_bytes()[:-4] + b"\0\0\1\0"
+    )
     capsys.readouterr()
     assert evaluate("e", *words, "--resume=true") == 1
-    assert "policy_sha256 (e was started with another; --overwrite=true starts over) differs" in error()
+    assert (
+        "policy_sha256 (e was started with another; --overwrite=true starts over) differs"
+        in error()
+    )
 
 
 def test_every_line_of_eval_json_can_be_replayed_alone(act, here, capsys):
@@ -138,7 +166,9 @@ def test_every_line_of_eval_json_can_be_replayed_alone(act, here, capsys):
     result = EvalResult.read(Path("e"))
     for episode in result.episodes:
         capsys.readouterr()
-        assert main(["eval", "e/eval.json", f"--replay={episode.seed}", f"--policy.path={act}"]) == 0
+        assert (
+            main(["eval", "e/eval.json", f"--replay={episode.seed}", f"--policy.path={act}"]) == 0
+        )
         out, err = capsys.readouterr()
         assert f"seed {episode.seed}, {episode.detail['condition']}: failure" in out
         assert "the same as in e/eval.json" in out
@@ -146,8 +176,13 @@ def test_every_line_of_eval_json_can_be_replayed_alone(act, here, capsys):
 
 
 def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys, error):
-    assert evaluate("e", f"--policy.path={act}", "--suite=sensing", "--eval.n_episodes=2", *SMALL) == 0
-    edit_json(Path("e/eval.json"), lambda data: data["episodes"][0].update({"success": True, "return": 3.0}))
+    assert (
+        evaluate("e", f"--policy.path={act}", "--suite=sensing", "--eval.n_episodes=2", *SMALL) == 0
+    )
+    edit_json(
+        Path("e/eval.json"),
+        lambda data: data["episodes"][0].update({"success": True, "return": 3.0}),
+    )
     edit_json(Path("e/eval.json"), lambda data: data["episodes"][1]["drawn"].update(delay=77))
     capsys.readouterr()
     assert main(["eval", "e", "--replay=4000000", f"--policy.path={act}"]) == 1
@@ -162,7 +197,10 @@ def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys, error):
 
 def test_a_replay_takes_the_policy_that_is_given_and_knows_another_one(here, capsys, error):
     act = write_checkpoint(here / "act", "act", env_spec(ENV))
-    assert evaluate("e", "--policy.path=act", "--eval.n_episodes=1", "--task.type=pick_place", *SMALL) == 0
+    assert (
+        evaluate("e", "--policy.path=act", "--eval.n_episodes=1", "--task.type=pick_place", *SMALL)
+        == 0
+    )
     capsys.readouterr()
     assert main(["eval", "e", "--replay=4000000"]) == 2
     assert "'act'; give that with --policy.path=DIR" in error()
@@ -176,12 +214,21 @@ def test_a_replay_takes_the_policy_that_is_given_and_knows_another_one(here, cap
 
 @pytest.mark.gl
 def test_failures_and_successes_are_filmed_and_a_replay_films_one(act, here):
-    expert = ["--policy.type=expert", "--task.type=reach", "--robot.type=fetch", "--workers=1", "--eval.n_episodes=2"]
+    expert = [
+        "--policy.type=expert",
+        "--task.type=reach",
+        "--robot.type=fetch",
+        "--workers=1",
+        "--eval.n_episodes=2",
+    ]
     assert evaluate("good", *expert, "--env.horizon=30", "--eval.films=1") == 0
     assert Path("good/report.html").read_text().count("<video") == 1
     words = [f"--policy.path={act}", "--suite=object", "--eval.n_episodes=3", *SMALL]
     assert evaluate("bad", *words, "--eval.films=2") == 0
     page = Path("bad/report.html").read_text()
     assert page.count("<video") == 2
-    assert main(["eval", "bad", "--replay=4000001", f"--policy.path={act}", "--video=deep/one.mp4"]) == 0
+    assert (
+        main(["eval", "bad", "--replay=4000001", f"--policy.path={act}", "--video=deep/one.mp4"])
+        == 0
+    )
     assert base64.b64encode(Path("deep/one.mp4").read_bytes()).decode() in page

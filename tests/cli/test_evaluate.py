@@ -1,4 +1,6 @@
-"""Any LeRobot checkpoint is measured by one command, and a bad one is refused in one line before the first step."""
+"""Any LeRobot checkpoint is measured by one command, and a bad one is refused in one line before
+the first step.
+"""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -50,11 +52,18 @@ def test_a_policy_of_pictures_is_shown_them_in_its_own_light(seeing, tmp_path, c
 def test_pictures_in_another_light_than_the_checkpoints_are_warned_of(seeing, tmp_path, capsys):
     edit_json(seeing / META_FILE, lambda meta: meta.update(look=None))
     assert evaluate(seeing, tmp_path / "e") == 0
-    [line] = [line for line in capsys.readouterr().err.splitlines() if "cameras_sha256 differs" in line]
+    [line] = [
+        line for line in capsys.readouterr().err.splitlines() if "cameras_sha256 differs" in line
+    ]
     for fingerprint in (env_fingerprint(ENV, DIM), env_fingerprint(ENV, replace(DIM, look=Look()))):
         assert fingerprint["cameras_sha256"][:12] in line
     (seeing / META_FILE).unlink()
-    assert evaluate(seeing, tmp_path / "e", "--robot.type=panda", "--task.type=reach", "--overwrite=true") == 0
+    assert (
+        evaluate(
+            seeing, tmp_path / "e", "--robot.type=panda", "--task.type=reach", "--overwrite=true"
+        )
+        == 0
+    )
     assert "does not say which robot and task it is for" in capsys.readouterr().err
 
 
@@ -72,14 +81,24 @@ def feature(kind: str, *shape: int) -> dict[str, object]:
     ("change", "words"),
     [
         (
-            {"input_features": {STATE: feature("STATE", 8), "observation.images.belly": feature("VISUAL", 3, 32, 32)}},
+            {
+                "input_features": {
+                    STATE: feature("STATE", 8),
+                    "observation.images.belly": feature("VISUAL", 3, 32, 32),
+                }
+            },
             "unknown camera 'belly'; known: front, side, wrist",
         ),
-        ({"output_features": {"action": feature("ACTION", 7)}}, "the policy has 7, panda/reach has 8"),
+        (
+            {"output_features": {"action": feature("ACTION", 7)}},
+            "the policy has 7, panda/reach has 8",
+        ),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_bad_checkpoint_is_one_line_before_the_first_step(change, words, act, tmp_path, monkeypatch, error):
+def test_a_bad_checkpoint_is_one_line_before_the_first_step(
+    change, words, act, tmp_path, monkeypatch, error
+):
     monkeypatch.setattr(ManipEnv, "advance", None)
     edit_config(act, **change)
     assert evaluate(act, tmp_path / "e") in (1, 2)

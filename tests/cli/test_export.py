@@ -1,4 +1,6 @@
-"""`manip-il export`: one file, refused early where it cannot be, and run without this package as the docs show."""
+"""`manip-il export`: one file, refused early where it cannot be, and run without this package as
+the docs show.
+"""
 
 import re
 import subprocess
@@ -26,7 +28,9 @@ WITHOUT = "import sys; sys.modules |= dict.fromkeys(('manip_il', 'lerobot', 'tor
 
 def write_run(folder: Path, kind: str = "mlp", observation: str = "state") -> Path:
     """A run with a policy where `train` leaves it; returns that policy's folder."""
-    spec = SPEC if observation == "state" else replace(SPEC, cameras=("front",), image_size=(32, 48))
+    spec = (
+        SPEC if observation == "state" else replace(SPEC, cameras=("front",), image_size=(32, 48))
+    )
     meta = Origin.of(spec, observation=observation)
     place = folder / "checkpoints" / "last" / "pretrained_model"
     return write_checkpoint(place, kind, spec, observation, origin=meta)
@@ -38,7 +42,9 @@ def test_it_tells_how_near_the_checkpoint_the_file_is(here, capsys):
     out, err = capsys.readouterr()
     assert err == ""
     first, last = out.splitlines()
-    difference = re.fullmatch(rf"largest difference from {policy.relative_to(here)} over random .*: (\S+)", first)
+    difference = re.fullmatch(
+        rf"largest difference from {policy.relative_to(here)} over random .*: (\S+)", first
+    )
     assert difference
     assert float(difference[1]) <= 1e-5
     assert last == f"exported: policy.onnx ({(here / 'policy.onnx').stat().st_size:,} bytes)"
@@ -66,7 +72,9 @@ def test_the_docs_snippet_runs_it_without_this_package(here, kind, observation):
     policy = LearnedPolicy.load(write_run(here / "run", kind, observation))
     assert main(["export", "run"]) == 0
     (here / "snippet.py").write_text(WITHOUT + SNIPPET)
-    done = subprocess.run([sys.executable, "-I", "snippet.py"], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-I", "snippet.py"], capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     said = [line.rsplit(" ", 2) for line in done.stdout.splitlines()]

@@ -20,7 +20,9 @@ def test_the_module_runs_as_a_program():
     run = [sys.executable, "-m", "manip_il.cli.main"]
     done = subprocess.run([*run, "recrod"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("manip-il: error: unknown command 'recrod' (did you mean 'record'?); known: ")
+    assert done.stderr.startswith(
+        "manip-il: error: unknown command 'recrod' (did you mean 'record'?); known: "
+    )
     assert done.stderr.count("\n") == 1
 
 
@@ -37,8 +39,10 @@ def test_the_module_runs_as_a_program():
         (
             ["fake", "--act=stop"],
             130,
-            "\nstopping after the current step (press Ctrl-C again to stop at once)\n"
-            "manip-il: interrupted; kept: 1 of 50 episodes in x; continue with --resume=true",
+            (
+                "\nstopping after the current step (press Ctrl-C again to stop at once)\n"
+                "manip-il: interrupted; kept: 1 of 50 episodes in x; continue with --resume=true"
+            ),
         ),
         (
             ["fake", "--act=interrupt"],
@@ -48,9 +52,11 @@ def test_the_module_runs_as_a_program():
         (
             ["fake", "--dataset.num_episods=1"],
             2,
-            "manip-il: error: unknown option '--dataset.num_episods' "
-            "(did you mean '--dataset.num_episodes' or '--dataset.root'?); "
-            "manip-il fake --help=all lists all",
+            (
+                "manip-il: error: unknown option '--dataset.num_episods' "
+                "(did you mean '--dataset.num_episodes' or '--dataset.root'?); "
+                "manip-il fake --help=all lists all"
+            ),
         ),
     ],
 )
@@ -63,7 +69,10 @@ def test_every_error_is_one_line_and_an_exit_code(words, code, line, capfd):
 def test_help_holds_options_defaults_and_an_example(words, capsys):
     assert main(words) == 0
     out = capsys.readouterr().out
-    assert "usage: manip-il fake [--option=value ...]\n\nDo what the tests ask.\n\nAnd say so.\n" in out
+    assert (
+        "usage: manip-il fake [--option=value ...]\n\nDo what the tests ask.\n\nAnd say so.\n"
+        in out
+    )
     assert re.search(r"--dataset.num_episodes=INT +how many episodes \[50\]\n", out)
     assert "--dataset.root=PATH" in out
     assert "example: manip-il fake --act=say" in out
@@ -74,7 +83,9 @@ def test_words_behind_two_dashes_are_another_programs(capsys):
     assert capsys.readouterr().err == "manip-il: error: --speed is 0.0; expected 0.1 to 10\n"
 
 
-@pytest.mark.parametrize("words", [["--debug", "fake", "--act=bug"], ["fake", "--act=bug", "--debug"]])
+@pytest.mark.parametrize(
+    "words", [["--debug", "fake", "--act=bug"], ["fake", "--act=bug", "--debug"]]
+)
 def test_debug_shows_the_traceback(words, capsys):
     assert main(words) == 1
     err = capsys.readouterr().err

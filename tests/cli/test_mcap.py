@@ -27,13 +27,31 @@ def dataset(tmp_path_factory) -> Path:
 def test_what_is_exported_is_imported_as_far_as_the_mapping_names_it(dataset, tmp_path, capsys):
     out, mapping = tmp_path / "out", tmp_path / "m.yaml"
     assert main(["data", "to-mcap", str(dataset), str(out)]) == 0
-    assert f"manip-il data from-mcap {out} DATASET --mapping={out / 'mapping.yaml'}" in capsys.readouterr().out
-    assert main(["data", "from-mcap", str(out), str(tmp_path / "all"), f"--mapping={out / 'mapping.yaml'}"]) == 0
+    assert (
+        f"manip-il data from-mcap {out} DATASET --mapping={out / 'mapping.yaml'}"
+        in capsys.readouterr().out
+    )
+    assert (
+        main(
+            [
+                "data",
+                "from-mcap",
+                str(out),
+                str(tmp_path / "all"),
+                f"--mapping={out / 'mapping.yaml'}",
+            ]
+        )
+        == 0
+    )
     assert capsys.readouterr().out == f"imported 2 episodes, 8 frames to {tmp_path / 'all'}\n"
-    feature = "{topic: /action, field: 'joints[name=b].position', dtype: float32, resample: previous, tolerance: 0.1}"
+    feature = (
+        "{topic: /action, field: 'joints[name=b].position', dtype: float32, resample: previous,"
+        " tolerance: 0.1}"
+    )
     mapping.write_text(f"fps: 10\ntask: t\nfeatures:\n  action: {feature}\n")
     assert main(["data", "from-mcap", str(out), str(tmp_path / "new"), f"--mapping={mapping}"]) == 0
     assert capsys.readouterr().out.startswith("imported 2 episodes, 4 frames")
     np.testing.assert_array_equal(
-        Dataset.open(tmp_path / "new").columns()["action"], Dataset.open(dataset).columns()["action"][::2, 1]
+        Dataset.open(tmp_path / "new").columns()["action"],
+        Dataset.open(dataset).columns()["action"][::2, 1],
     )

@@ -1,4 +1,7 @@
-"""Mistakes are one line and exit code 2; like help, they are answered before anything heavy is imported."""
+"""Mistakes are one line and exit code 2.
+
+Like help, they are answered before anything heavy is imported.
+"""
 
 import json
 import subprocess
@@ -9,7 +12,18 @@ import manip_il
 from manip_il import __version__
 from manip_il.cli.main import COMMANDS, GROUPS
 
-HEAVY = ["torch", "lerobot", "mujoco", "mink", "scipy", "pyarrow", "av", "PIL", "mcap", "huggingface_hub"]
+HEAVY = [
+    "torch",
+    "lerobot",
+    "mujoco",
+    "mink",
+    "scipy",
+    "pyarrow",
+    "av",
+    "PIL",
+    "mcap",
+    "huggingface_hub",
+]
 LIGHT = [*HEAVY, "draccus", "rich", "yaml"]
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "datasets" / "sample"
@@ -30,10 +44,21 @@ print(json.dumps(answers))
 """
 
 
-def answers(cases: list[list[str]], cwd: Path, heavy: list[str]) -> list[tuple[list[str], int, str, str]]:
-    """Words, exit code and output of one command line after the other, in one process that loads nothing heavy."""
+def answers(
+    cases: list[list[str]], cwd: Path, heavy: list[str]
+) -> list[tuple[list[str], int, str, str]]:
+    """Words, exit code and output of one command line after the other, in one process that loads
+    nothing heavy.
+    """
     asked = json.dumps([heavy, cases])
-    done = subprocess.run([sys.executable, "-c", RUN], input=asked, capture_output=True, text=True, check=True, cwd=cwd)
+    done = subprocess.run(
+        [sys.executable, "-c", RUN],
+        input=asked,
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=cwd,
+    )
     given = json.loads(done.stdout)
     assert [(words, loaded) for words, *_, loaded in given if loaded] == []
     return [tuple(answer[:-1]) for answer in given]
@@ -66,7 +91,9 @@ MISTAKES = {
     "train --dataset.root=lerobot/pusht": "manip-il pull hf://datasets/lerobot/pusht FOLDER",
     f"{TRAIN} --policy.path=missing": "no policy in missing",
     f"{TRAIN} --policy=act": "did you mean '--policy.NAME'",
-    f"{TRAIN} --action_space=ee_detla": "--action_space: expected joint_target|joint_delta|ee_delta, got 'ee_detla'",
+    f"{TRAIN} --action_space=ee_detla": (
+        "--action_space: expected joint_target|joint_delta|ee_delta, got 'ee_detla'"
+    ),
     f"{TRAIN} --wandb.projekt=a --policy.type=act": "did you mean 'project'",
     f"{TRAIN} --policy.type=akt --observation=images": "unknown policy 'akt' (did you mean 'act'?)",
     "eval": "--policy.path=DIR",
@@ -76,10 +103,16 @@ MISTAKES = {
     f"{EXPERT} --suite=nominall": "did you mean 'nominal'?",
     f"{EXPERT} --until_width=2": "--until_width is 2.0; expected 0.0001 to 1",
     "compare a b": "a does not exist; expected two sides, each an eval.json, a policy",
-    "record --robot.type=pandas": "unknown robot 'pandas' (did you mean 'panda'?); known: fetch, panda",
+    "record --robot.type=pandas": (
+        "unknown robot 'pandas' (did you mean 'panda'?); known: fetch, panda"
+    ),
     "record --num_episodes=3": "did you mean '--dataset.num_episodes'?",
-    "record --cameras=front,wirst": "unknown camera 'wirst' (did you mean 'wrist'?); known: front, side, wrist",
-    "record --cameras=front --image.height=127": "pictures have height 127 and width 128; expected even numbers",
+    "record --cameras=front,wirst": (
+        "unknown camera 'wirst' (did you mean 'wrist'?); known: front, side, wrist"
+    ),
+    "record --cameras=front --image.height=127": (
+        "pictures have height 127 and width 128; expected even numbers"
+    ),
     "record --dataset.repo_id=../name": "expected a name of letters",
     "dagger --config_path=missing.yaml": "cannot read missing.yaml",
     "dagger --beta=lineal:5": "beta is 'lineal:5'; expected constant:B, linear:ROUNDS",
@@ -87,7 +120,9 @@ MISTAKES = {
     "dagger --hold=-1": "hold is -1; expected at least 0",
     "dagger --policy.type=act --query=one": "use label=branch or label=takeover",
     "data check": "DATASET is missing",
-    "data render SAMPLE x --look.brightness=9": "brightness is 9.0; expected a factor from 0.1 to 2.0",
+    "data render SAMPLE x --look.brightness=9": (
+        "brightness is 9.0; expected a factor from 0.1 to 2.0"
+    ),
     "data redraw SAMPLE SAMPLE --overwrite=true": "overlaps",
     "push SAMPLE": "REMOTE is missing",
     "push missing hf://me/x": "missing does not exist; expected a dataset, a run or a policy",
@@ -100,23 +135,42 @@ MISTAKES = {
 
 def test_a_mistake_is_one_line_with_the_nearest_name_and_leaves_nothing(tmp_path):
     lines = [line.replace("SAMPLE", str(SAMPLE)).split() for line in MISTAKES]
-    for (words, code, _, err), says in zip(answers(lines, tmp_path, []), MISTAKES.values(), strict=True):
-        assert (code in (1, 2), err.count("manip-il: error: "), says in err) == (True, 1, True), (words, says, err)
+    for (words, code, _, err), says in zip(
+        answers(lines, tmp_path, []), MISTAKES.values(), strict=True
+    ):
+        assert (code in (1, 2), err.count("manip-il: error: "), says in err) == (True, 1, True), (
+            words,
+            says,
+            err,
+        )
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_environments_are_registered_whatever_is_imported_first():
-    code = "import gymnasium, manip_il; print(gymnasium.spec('manip_il/PandaPickPlace-v0').entry_point)"
+    code = (
+        "import gymnasium, manip_il;"
+        " print(gymnasium.spec('manip_il/PandaPickPlace-v0').entry_point)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "manip_il.worlds.ladder.world:make_env\n"
 
 
 def test_the_package_shows_what_a_user_wants_and_alone_loads_no_simulator():
-    code = "import sys, manip_il; print(dir(manip_il)); assert not {'mujoco', 'scipy', 'torch'} & sys.modules.keys()"
+    code = (
+        "import sys, manip_il; print(dir(manip_il)); assert not {'mujoco', 'scipy', 'torch'} &"
+        " sys.modules.keys()"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert {"Checkpoint", "Dataset", "Expert", "dagger", "evaluate", "make_env", "record", "train"} <= {
-        *json.loads(done.stdout.replace("'", '"'))
-    }
+    assert {
+        "Checkpoint",
+        "Dataset",
+        "Expert",
+        "dagger",
+        "evaluate",
+        "make_env",
+        "record",
+        "train",
+    } <= {*json.loads(done.stdout.replace("'", '"'))}
     env = manip_il.make_env("fetch", "reach")
     assert (env.scene.robot.name, env.task) == ("fetch", "reach")
     assert manip_il.Expert(env.scene).label(env.get_state()).valid

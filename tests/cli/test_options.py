@@ -8,7 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manip_il.cli.parsing import Given, Open, dump_yaml, from_layers, from_yaml, options_of, parse, word
+from manip_il.cli.parsing import (
+    Given,
+    Open,
+    dump_yaml,
+    from_layers,
+    from_yaml,
+    options_of,
+    parse,
+    word,
+)
 from manip_il.cli.parsing import given as given_of
 from manip_il.errors import UsageError
 from manip_il.option import option
@@ -73,8 +82,18 @@ def test_words_change_what_they_name(words, change):
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        (["--los=l1"], ["unknown option '--los'", "did you mean '--loss'", "manip-il COMMAND --help=all lists all"]),
-        (["--repo-id=x"], ["unknown option '--repo_id' (did you mean '--small.repo_id' or '--dataset.repo_id'?)"]),
+        (
+            ["--los=l1"],
+            [
+                "unknown option '--los'",
+                "did you mean '--loss'",
+                "manip-il COMMAND --help=all lists all",
+            ],
+        ),
+        (
+            ["--repo-id=x"],
+            ["unknown option '--repo_id' (did you mean '--small.repo_id' or '--dataset.repo_id'?)"],
+        ),
         (["--dataset=x"], ["unknown option '--dataset' (did you mean '--dataset.root'"]),
         (["--lr=fast"], ["--lr", "expected FLOAT", "'fast'"]),
         (["--dataset.num_episodes=1.5"], ["--dataset.num_episodes", "expected INT", "'1.5'"]),
@@ -103,14 +122,20 @@ def test_words_beat_yaml_beats_defaults(tmp_path):
     path.write_text("dataset: {num_episodes: 9, root: a}\nlr: 1e-4\ncameras: [front]\nsmall:\n")
     options = parse(Options, ["--dataset.num_episodes=8", f"--config_path={path}"])
     assert options == Options(
-        dataset=Dataset(num_episodes=8, root=Path("a")), lr=1e-4, cameras=["front"], small=Dataset(num_episodes=3)
+        dataset=Dataset(num_episodes=8, root=Path("a")),
+        lr=1e-4,
+        cameras=["front"],
+        small=Dataset(num_episodes=3),
     )
 
 
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
-        ("dataset: {num_episode: 9}", ["dataset.num_episode", "did you mean 'dataset.num_episodes'"]),
+        (
+            "dataset: {num_episode: 9}",
+            ["dataset.num_episode", "did you mean 'dataset.num_episodes'"],
+        ),
         ("resume: 1", ["resume: expected true|false, got 1"]),
         ("dataset: {repo_id: no}", ["expected TEXT, got False"]),
         ("a: [", ["is not YAML"]),
@@ -128,7 +153,8 @@ text = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
 datasets = st.builds(
     Dataset,
     repo_id=text,
-    root=st.none() | st.lists(st.from_regex(r"[\w. -]{1,8}", fullmatch=True), min_size=1).map(lambda p: Path(*p)),
+    root=st.none()
+    | st.lists(st.from_regex(r"[\w. -]{1,8}", fullmatch=True), min_size=1).map(lambda p: Path(*p)),
     num_episodes=st.integers(min_value=1),
 )
 numbers = st.floats(allow_nan=False)
@@ -157,7 +183,8 @@ def test_options_survive_yaml(tmp_path_factory, options):
 
 @given(any_options)
 def test_options_survive_the_command_line(options):
-    options = replace(options, cameras=[], note=None)  # a comma in an item, and the text "null", need YAML
+    # a comma in an item, and the text "null", need YAML
+    options = replace(options, cameras=[], note=None)
     words = [f"--{option.name}={word(option.value(options))}" for option in options_of(Options)]
     assert parse(Options, words) == options
 
@@ -202,13 +229,19 @@ class Fit:
 
 def test_of_layers_the_later_one_counts():
     common = {"policy": {"width": 8, "depth": 1}, "data": {"num_episodes": 7}, "steps": 20}
-    fit = from_layers(Fit, [("common", common), ("arm", {"policy.width": 16, "data.repo_id": "a/b", "steps": 5})])
+    fit = from_layers(
+        Fit, [("common", common), ("arm", {"policy.width": 16, "data.repo_id": "a/b", "steps": 5})]
+    )
     assert fit == Fit({"width": 16, "depth": 1}, Dataset("a/b", num_episodes=7), 5)
     assert from_layers(Fit, []) == Fit()
 
 
 def test_a_layers_error_says_which_layer():
-    with pytest.raises(UsageError, match=r"unknown key in x.yaml: arms.a: 'stepps' \(did you mean 'steps'\?\)"):
+    with pytest.raises(
+        UsageError, match=r"unknown key in x.yaml: arms.a: 'stepps' \(did you mean 'steps'\?\)"
+    ):
         from_layers(Fit, [("x.yaml: common", {"steps": 3}), ("x.yaml: arms.a", {"stepps": 3})])
-    with pytest.raises(UsageError, match=r"x.yaml: arms.a: data.num_episodes: expected INT, got 'many'"):
+    with pytest.raises(
+        UsageError, match=r"x.yaml: arms.a: data.num_episodes: expected INT, got 'many'"
+    ):
         from_layers(Fit, [("x.yaml: arms.a", {"data": {"num_episodes": "many"}})])

@@ -9,7 +9,13 @@ import pytest
 
 from manip_il.cli.imitation import DatasetGroup, RecordOptions, SourceGroup, TrainOptions
 from manip_il.cli.main import main
-from manip_il.cli.outputs import CONFIG_FILE, OutputFile, check_same_options, prepare_output, save_options
+from manip_il.cli.outputs import (
+    CONFIG_FILE,
+    OutputFile,
+    check_same_options,
+    prepare_output,
+    save_options,
+)
 from manip_il.cli.parsing import CONFIG_HEADER
 from manip_il.data.atomic import DATASET, EPISODES, exclusive, output_of, write_file
 from manip_il.data.lerobot_layout import OURS
@@ -24,7 +30,9 @@ EVALUATION = output_of("Eval")
 @pytest.fixture
 def ours(tmp_path):
     folder = tmp_path / "run"
-    write_file(folder / "config.yaml", f"{CONFIG_HEADER} 0: resolved options (EvalOptions)\n".encode())
+    write_file(
+        folder / "config.yaml", f"{CONFIG_HEADER} 0: resolved options (EvalOptions)\n".encode()
+    )
     return folder
 
 
@@ -61,18 +69,36 @@ def test_a_run_that_was_killed_before_it_wrote_its_options_can_be_gone_on_with(t
 @pytest.mark.parametrize(
     ("name", "content", "kind"),
     [
-        ("config.yaml", f"{CONFIG_HEADER} 0.1.0: resolved options (EvalOptions)\nseed: 0\n", EVALUATION),
-        ("config.yaml", f"{CONFIG_HEADER} 0.1.0: resolved options (TrainOptions)\nseed: 0\n", output_of("Train")),
-        ("config.yaml", f"{CONFIG_HEADER} 0.1.0: resolved options (RecordOptions)\nseed: 0\n", EPISODES),
+        (
+            "config.yaml",
+            f"{CONFIG_HEADER} 0.1.0: resolved options (EvalOptions)\nseed: 0\n",
+            EVALUATION,
+        ),
+        (
+            "config.yaml",
+            f"{CONFIG_HEADER} 0.1.0: resolved options (TrainOptions)\nseed: 0\n",
+            output_of("Train"),
+        ),
+        (
+            "config.yaml",
+            f"{CONFIG_HEADER} 0.1.0: resolved options (RecordOptions)\nseed: 0\n",
+            EPISODES,
+        ),
         ("recording.json", json.dumps({"only_successes": True}), EPISODES),
-        ("meta/info.json", json.dumps({"features": {"action": {}, "executed_action": {}, "sim_state": {}}}), DATASET),
+        (
+            "meta/info.json",
+            json.dumps({"features": {"action": {}, "executed_action": {}, "sim_state": {}}}),
+            DATASET,
+        ),
         (OURS, json.dumps({"spec": {}, "fingerprint": {}}), DATASET),
         ("eval.json", json.dumps({"success_rate": 1.0, "fingerprint": {}}), EVALUATION),
         ("config.yaml", "seed: 0\n", None),
         ("thesis.tex", "years of work", None),
     ],
 )
-def test_overwrite_deletes_the_same_kind_that_this_program_made_and_nothing_else(tmp_path, name, content, kind):
+def test_overwrite_deletes_the_same_kind_that_this_program_made_and_nothing_else(
+    tmp_path, name, content, kind
+):
     write_file(tmp_path / "run" / name, content.encode())
     for other in {EVALUATION, DATASET, EPISODES, output_of("Train")} - {kind}:
         with pytest.raises(UsageError, match=kind or "did not make"):
@@ -125,7 +151,9 @@ def test_overwrite_spares_what_is_read_and_follows_no_link(ours, tmp_path):
     assert main(["theory", str(ours / "dagger"), f"--output_dir={ours}", "--overwrite=true"]) == 2
     assert main(["data", "build", str(ours), str(ours), "--overwrite=true"]) == 2
     (ours / "mine.yaml").write_text("joint_noise: 0.1\n")
-    assert main([*EVAL, f"--suite={ours}/mine.yaml", f"--output_dir={ours}", "--overwrite=true"]) == 2
+    assert (
+        main([*EVAL, f"--suite={ours}/mine.yaml", f"--output_dir={ours}", "--overwrite=true"]) == 2
+    )
     assert (ours / "dagger").is_dir()
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "main.tex").touch()
@@ -141,13 +169,16 @@ def test_a_folder_that_is_in_use_is_refused(how, here, error):
     with exclusive(out):
         assert main([*EVAL, f"--output_dir={out}", *([how] if how else [])]) == 1
         assert error().endswith(
-            f": {out} is in use by another process; wait until that is done, or choose another folder"
+            f": {out} is in use by another process; wait until that is done, or choose another"
+            " folder"
         )
     assert not out.exists()
 
 
 def test_a_resumed_run_may_have_more_steps_but_no_fewer(tmp_path):
-    save_options(tmp_path, resumed := TrainOptions(dataset=SourceGroup([tmp_path]), fit={"steps": 4}))
+    save_options(
+        tmp_path, resumed := TrainOptions(dataset=SourceGroup([tmp_path]), fit={"steps": 4})
+    )
     check_same_options(tmp_path, replace(resumed, fit={"steps": 8}))
     for other in ({"steps": 2}, {}):
         with pytest.raises(MismatchError, match="--steps"):

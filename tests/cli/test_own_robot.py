@@ -11,7 +11,13 @@ from manip_il.data.dataset import Dataset
 from ..robots.own import write
 
 REACH = ("--task.type=reach", "--workers=1")
-SHORT = ("--demonstrations=2", "--episodes_per_round=1", "--rounds=1", "--validation_episodes=1", "--steps=2")
+SHORT = (
+    "--demonstrations=2",
+    "--episodes_per_round=1",
+    "--rounds=1",
+    "--validation_episodes=1",
+    "--steps=2",
+)
 
 
 @pytest.mark.slow
@@ -28,16 +34,29 @@ def test_it_is_recorded_learnt_evaluated_improved_and_rendered(
     assert [one.name for one in tmp_path.iterdir()] == ["arms"]
     assert main(["record", robot, *REACH, "--dataset.num_episodes=2"]) == 0
     assert Dataset.open(Path("datasets/mine_reach")).spec.robot == "mine"
-    assert main(["train", "--dataset.root=datasets/mine_reach", "--steps=2", "--output_dir=run"]) == 0
+    assert (
+        main(["train", "--dataset.root=datasets/mine_reach", "--steps=2", "--output_dir=run"]) == 0
+    )
     assert "warning" not in capsys.readouterr().err
-    words = ["eval", robot, *REACH, "--policy.path=run", "--eval.n_episodes=1", "--eval.films=0", "--output_dir=test"]
+    words = [
+        "eval",
+        robot,
+        *REACH,
+        "--policy.path=run",
+        "--eval.n_episodes=1",
+        "--eval.films=0",
+        "--output_dir=test",
+    ]
     assert main(words) == 0
     assert json.loads(Path("test/eval.json").read_text())["robot"] == "mine"
     assert main(["dagger", robot, *REACH, *SHORT, "--output_dir=dagger"]) == 0
     assert (tmp_path / "dagger" / "best").is_dir()
     render = ["data", "render", "datasets/mine_reach", "seen", "--cameras=front"]
     assert main(render) == 2
-    assert "unknown robot 'mine'; known: fetch, panda, so101, the path of a YAML" in capsys.readouterr().err
+    assert (
+        "unknown robot 'mine'; known: fetch, panda, so101, the path of a YAML"
+        in capsys.readouterr().err
+    )
     assert main([*render, "--robot.type=panda"]) == 1
     assert "robot differs" in capsys.readouterr().err
     assert main([*render, robot]) == 0

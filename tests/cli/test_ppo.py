@@ -1,4 +1,6 @@
-"""`manip-il rl ppo`: a clone goes on from a reward learnt from preferences, of the same robot and task."""
+"""`manip-il rl ppo`: a clone goes on from a reward learnt from preferences, of the same robot
+and task.
+"""
 
 import json
 from pathlib import Path
@@ -36,11 +38,22 @@ def cloned(tmp_path_factory) -> Path:
 def test_a_run_ends_with_a_policy_metrics_and_a_page(here, cloned, capsys):
     reward(here / "reward")
     small = "--steps=1 --episodes=2 --episode_steps=4 --warmup=0 --ppo.minibatches=1 --ppo.epochs=1"
-    words = ["rl", "ppo", f"--init={cloned}", "--reward=reward", *small.split(), "--validation_episodes=1"]
+    words = [
+        "rl",
+        "ppo",
+        f"--init={cloned}",
+        "--reward=reward",
+        *small.split(),
+        "--validation_episodes=1",
+    ]
     assert main([*words, "--output_dir=run", "--quiet"]) == 0
     assert "manip-il eval --policy.path=run" in capsys.readouterr().out
     start, record = map(json.loads, (here / "run" / "metrics.jsonl").read_text().splitlines())
-    assert (start["iteration"], start["steps"], start["validation_episodes"]) == (0, 0, 1), "the clone itself"
+    assert (start["iteration"], start["steps"], start["validation_episodes"]) == (
+        0,
+        0,
+        1,
+    ), "the clone itself"
     assert record["steps"] == 8, "episodes go on after success"
     assert (here / "run" / "best" / "pretrained_model" / "model.safetensors").is_file()
     assert "PPO on" in (here / "run" / "report.html").read_text()

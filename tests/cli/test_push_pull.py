@@ -34,7 +34,9 @@ def test_there_and_back_and_again_nothing_travels(run, url, tmp_path, capsys):
     assert captured.err == ""
     assert (target / "metrics.jsonl").read_bytes() == b"x" * 1500
     assert main(["push", str(run), url]) == 0
-    assert capsys.readouterr().out.splitlines()[0] == f"{url}: 0 files, 0 bytes, uploaded; 0 removed"
+    assert (
+        capsys.readouterr().out.splitlines()[0] == f"{url}: 0 files, 0 bytes, uploaded; 0 removed"
+    )
 
 
 def test_dry_runs_only_say(run, url, tmp_path, capsys):
@@ -48,7 +50,11 @@ def test_dry_runs_only_say(run, url, tmp_path, capsys):
     main(["push", str(run), url])
     capsys.readouterr()
     assert main(["pull", url, str(tmp_path / "got"), "--dry-run=true"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1].endswith("a policy of 2 files, 1.5 kB, would be downloaded")
+    assert (
+        capsys.readouterr()
+        .out.splitlines()[-1]
+        .endswith("a policy of 2 files, 1.5 kB, would be downloaded")
+    )
     assert not (tmp_path / "got").exists()
 
 
@@ -57,7 +63,10 @@ def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(run, url, t
     target = tmp_path / "got"
     target.mkdir()
     (target / "thesis.txt").write_text("mine")
-    for asked, says in (("false", "--overwrite=true replaces it"), ("true", "manip-il did not make")):
+    for asked, says in (
+        ("false", "--overwrite=true replaces it"),
+        ("true", "manip-il did not make"),
+    ):
         assert main(["pull", url, str(target), f"--overwrite={asked}"]) == 2
         assert says in capsys.readouterr().err
     assert (target / "thesis.txt").read_text() == "mine"
@@ -69,7 +78,8 @@ def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(run, url, t
 def test_a_traceback_of_any_error_is_cleaned(run, url, monkeypatch, capsys):
     def fail(words: object):
         raise RuntimeError(
-            "PUT https://store/x?X-Amz-Signature=0123456789abcdef with Authorization: Bearer hf_HunterTwo"
+            "PUT https://store/x?X-Amz-Signature=0123456789abcdef with Authorization: Bearer"
+            " hf_HunterTwo"
         )
 
     monkeypatch.setattr("manip_il.cli.run.transfer.run_push", fail)

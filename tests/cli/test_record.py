@@ -1,4 +1,6 @@
-"""Datasets: built again from journals to the bytes that were recorded, and rendered again with other pictures."""
+"""Datasets: built again from journals to the bytes that were recorded, and rendered again with
+other pictures.
+"""
 
 import shutil
 from dataclasses import asdict
@@ -21,7 +23,14 @@ from .made_runs import files
 
 
 def record(root: Path, *words: str) -> list[str]:
-    return ["record", "--robot.type=fetch", f"--dataset.root={root}", "--dataset.num_episodes=3", "--workers=1", *words]
+    return [
+        "record",
+        "--robot.type=fetch",
+        f"--dataset.root={root}",
+        "--dataset.num_episodes=3",
+        "--workers=1",
+        *words,
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +61,9 @@ def test_the_journals_give_the_datasets_bytes_again(recorded, tmp_path):
     assert files(tmp_path / "again") == files(recorded)
 
 
-def test_a_damaged_journal_is_named_and_its_seed_runs_again_once_it_is_deleted(recorded, tmp_path, capsys):
+def test_a_damaged_journal_is_named_and_its_seed_runs_again_once_it_is_deleted(
+    recorded, tmp_path, capsys
+):
     journals = tmp_path / "x.journals"
     shutil.copytree(journals_of(recorded), journals)
     cut = list_episodes(journals)[1]
@@ -60,14 +71,22 @@ def test_a_damaged_journal_is_named_and_its_seed_runs_again_once_it_is_deleted(r
     assert main(["data", "build", str(journals), str(tmp_path / "x")]) == 1
     assert f"error: {cut} is not a complete episode" in capsys.readouterr().err
     cut.unlink()
-    assert main(["record", *record(tmp_path / "x", "--dataset.repo_id=me/demos", "--resume=true")[1:]]) == 0
+    assert (
+        main(["record", *record(tmp_path / "x", "--dataset.repo_id=me/demos", "--resume=true")[1:]])
+        == 0
+    )
     assert files(tmp_path / "x") == files(recorded)
 
 
 @pytest.mark.slow
 @pytest.mark.gl
 def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_or_two(tmp_path):
-    pictured = ["--cameras=front,wrist", "--image.height=64", "--image.width=80", "--task.type=reach"]
+    pictured = [
+        "--cameras=front,wrist",
+        "--image.height=64",
+        "--image.width=80",
+        "--task.type=reach",
+    ]
     pictured += ["--dataset.rgb_encoder.crf=20"]
     assert main(record(tmp_path / "one", *pictured)) == 0
     assert '"video.crf": 20' in (tmp_path / "one/meta/info.json").read_text()
@@ -78,7 +97,9 @@ def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_o
     frames = Dataset.open(tmp_path / "one").columns(["index"])["index"]
     episodes = list(read_episodes(tmp_path / "one"))
     for camera in ("front", "wrist"):
-        decoded = np.concatenate([episode.columns[f"observation.images.{camera}"] for episode in episodes])
+        decoded = np.concatenate(
+            [episode.columns[f"observation.images.{camera}"] for episode in episodes]
+        )
         assert decoded.shape == (len(frames), 64, 80, 3)
         assert len(np.unique(decoded)) > 50  # something is to be seen
     [video, _] = (tmp_path / "again").rglob("*.mp4")
@@ -102,7 +123,13 @@ def demos(here) -> Path:
 @pytest.mark.gl
 @pytest.mark.slow
 def test_two_workers_write_the_bytes_of_one(demos):
-    words = ["--cameras=wrist", "--image.height=32", "--image.width=32", "--look.shadows=true", "--look.light_turn=30"]
+    words = [
+        "--cameras=wrist",
+        "--image.height=32",
+        "--image.width=32",
+        "--look.shadows=true",
+        "--look.light_turn=30",
+    ]
     assert main(["data", "render", "demos", "one", "--workers=1", *words]) == 0
     Path("again").mkdir()
     assert main(["data", "render", "demos", "again/one", "--workers=2", *words]) == 0

@@ -39,7 +39,20 @@ def no_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_without_opengl_the_page_says_so(own: Path, tmp_path: Path, no_opengl: None, capsys):
     out = tmp_path / "out"
-    assert main(["--quiet", "robot", "check", str(own), "--tasks=reach", "--episodes=0", f"--output_dir={out}"]) == 0
+    assert (
+        main(
+            [
+                "--quiet",
+                "robot",
+                "check",
+                str(own),
+                "--tasks=reach",
+                "--episodes=0",
+                f"--output_dir={out}",
+            ]
+        )
+        == 0
+    )
     said = capsys.readouterr()
     assert "own has starts for 1 of 1 tasks; the expert was not run." in said.out
     page, found = (out / "check.html").read_text(), json.loads((out / "check.json").read_text())
@@ -52,21 +65,35 @@ def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_op
     tree = tree_of()
     tree["gripper"]["open"] = [0.02, 0.02]
     path, out = with_map(write(tmp_path, "narrow", tree=tree)), tmp_path / "out"
-    words = ["--quiet", "robot", "check", str(path), "--tasks=reach,lift", "--episodes=0", f"--output_dir={out}"]
+    words = [
+        "--quiet",
+        "robot",
+        "check",
+        str(path),
+        "--tasks=reach,lift",
+        "--episodes=0",
+        f"--output_dir={out}",
+    ]
     assert main(words) == 1
     said = capsys.readouterr()
-    assert "narrow has starts for 1 of 2 tasks; the expert was not run; it cannot do lift." in said.out
+    assert (
+        "narrow has starts for 1 of 2 tasks; the expert was not run; it cannot do lift." in said.out
+    )
     assert "change: lift: task lift: 'object' is 0.050 m wide" in said.out
     assert "cannot do 1 of 2 tasks: lift" in said.err
     assert (out / "check.html").is_file()
 
 
-def test_parts_that_overlap_at_home_are_named_with_their_depth(own: Path, tmp_path: Path, no_opengl: None, capsys):
+def test_parts_that_overlap_at_home_are_named_with_their_depth(
+    own: Path, tmp_path: Path, no_opengl: None, capsys
+):
     elbow = '<geom size="0.06" pos="0 0 0.3" mass="0.1"/><body name="wrist"'
     words = ["--quiet", "robot", "check", "--tasks=reach", "--episodes=0"]
     main([*words, str(own), f"--output_dir={tmp_path / 'apart'}"])
     assert "At home" not in capsys.readouterr().out
-    thick = with_map(write(tmp_path, "thick", model=model_of().replace('<body name="wrist"', elbow)))
+    thick = with_map(
+        write(tmp_path, "thick", model=model_of().replace('<body name="wrist"', elbow))
+    )
     main([*words, str(thick), f"--output_dir={tmp_path / 'overlap'}"])
     assert "fore and hand by 10.0 mm" in capsys.readouterr().out
 
@@ -75,7 +102,20 @@ def test_parts_that_overlap_at_home_are_named_with_their_depth(own: Path, tmp_pa
 @pytest.mark.slow
 def test_the_page_of_an_arm_has_pictures_and_episodes(own: Path, tmp_path: Path, capsys):
     out = tmp_path / "out"
-    assert main(["--quiet", "robot", "check", str(own), "--tasks=reach", "--episodes=2", f"--output_dir={out}"]) == 0
+    assert (
+        main(
+            [
+                "--quiet",
+                "robot",
+                "check",
+                str(own),
+                "--tasks=reach",
+                "--episodes=2",
+                f"--output_dir={out}",
+            ]
+        )
+        == 0
+    )
     assert "| 50 of 50 | 100" in capsys.readouterr().out.replace("  ", " ")
     assert "The arm at home in its scene" in (out / "check.html").read_text()
     assert json.loads((out / "check.json").read_text())["tasks"][0]["clean"]["success_rate"] == 1

@@ -1,4 +1,6 @@
-"""However an address is written, no part of its password is printed: not in errors, not in tracebacks."""
+"""However an address is written, no part of its password is printed: not in errors, not in
+tracebacks.
+"""
 
 import contextlib
 import io
@@ -14,7 +16,20 @@ from manip_il.cli.main import main
 LETTERS = "abcdefgijkmnqtuvwyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789@:/%#?[]!&=+.~-_\\'\"$ "
 SECRETS = st.text(LETTERS, min_size=8, max_size=20).filter(lambda text: text == text.strip())
 SCHEMES = st.sampled_from(
-    ["sftp://", "s3://", "hf://", "file://", "https://", "ftp://", "sftp:/", "sftp:", "SFTP://", "sftp:///", "u:", ""]
+    [
+        "sftp://",
+        "s3://",
+        "hf://",
+        "file://",
+        "https://",
+        "ftp://",
+        "sftp:/",
+        "sftp:",
+        "SFTP://",
+        "sftp:///",
+        "u:",
+        "",
+    ]
 )
 USERS = st.sampled_from(["u", "", "me.too", "a/b", "datasets/me", "a@b", "u:v"])
 BEHIND = st.sampled_from(
@@ -41,10 +56,21 @@ def _nowhere():
         yield
 
 
-def said_of(scheme: str, user: str, secret: str, behind: str, word: str, coded: bool, command: str) -> str:
+def said_of(
+    scheme: str, user: str, secret: str, behind: str, word: str, coded: bool, command: str
+) -> str:
     address = f"{scheme}{user}:{quote(secret, safe='') if coded else secret}{behind}"
-    words = word.format(address).split(" ", 1) if word.startswith("--debug") else [word.format(address)]
-    return printed([command, *(["out"] if command == "push" else []), *words, *(["out"] if command == "pull" else [])])
+    words = (
+        word.format(address).split(" ", 1) if word.startswith("--debug") else [word.format(address)]
+    )
+    return printed(
+        [
+            command,
+            *(["out"] if command == "push" else []),
+            *words,
+            *(["out"] if command == "pull" else []),
+        ]
+    )
 
 
 @settings(max_examples=300)
@@ -53,7 +79,9 @@ def said_of(scheme: str, user: str, secret: str, behind: str, word: str, coded: 
 @example("sftp://", "u", "22/password", "@h/x", "{}", False, "pull")
 @example("sftp://", "u", "password", "@h/x", "--{}", False, "pull")
 @example("sftp://", "u", "0000back", "@h/x", "--debug {}", False, "pull")  # as in "Traceback"
-def test_no_tail_of_a_password_is_printed(scheme, user, secret, behind, word, coded, command) -> None:
+def test_no_tail_of_a_password_is_printed(
+    scheme, user, secret, behind, word, coded, command
+) -> None:
     assume(secret[-4:] not in said_of(scheme, user, "another one", behind, word, coded, command))
     said = said_of(scheme, user, secret, behind, word, coded, command)
     assert secret not in said

@@ -1,4 +1,6 @@
-"""What a dataset, a policy or an evaluation names is never a path: nothing outside its folder is opened or run."""
+"""What a dataset, a policy or an evaluation names is never a path: nothing outside its folder is
+opened or run.
+"""
 
 import contextlib
 import json
@@ -38,7 +40,11 @@ def _notice(event: str, arguments: tuple[Any, ...]) -> None:
     if _noticed is None or event not in (*RUNS, "open"):
         return
     what = arguments[0].co_filename if event == "exec" else arguments[0]
-    inside = isinstance(what, str | Path) and os.path.lexists(what) and HERE in Path(os.path.abspath(what)).parts
+    inside = (
+        isinstance(what, str | Path)
+        and os.path.lexists(what)
+        and HERE in Path(os.path.abspath(what)).parts
+    )
     if inside or event in RUNS[1:]:
         _noticed.append(f"{event} {what}")
         raise PermissionError(str(what))
@@ -108,8 +114,24 @@ FILES: dict[str, tuple[Callable[[Path], None], ...]] = {  # a file of metadata, 
 }
 NAMED = {"task": "evil.py", "robot": "evil.yaml", "object": "mesh:BASE/here/pipe.stl:0.1"}
 HOSTILE = (
-    *("evil", "evil.py", "./evil.py", "~/evil.py", "../here/evil.py", "BASE/here/evil.py", "evil:evil", "evil.evil"),
-    *("evil.yaml", "BASE/here/evil.yaml", "carry:evil.json", "carry:BASE/here/evil.json", "policy", "BASE/here/policy"),
+    *(
+        "evil",
+        "evil.py",
+        "./evil.py",
+        "~/evil.py",
+        "../here/evil.py",
+        "BASE/here/evil.py",
+        "evil:evil",
+        "evil.evil",
+    ),
+    *(
+        "evil.yaml",
+        "BASE/here/evil.yaml",
+        "carry:evil.json",
+        "carry:BASE/here/evil.json",
+        "policy",
+        "BASE/here/policy",
+    ),
     *(
         "mesh:evil.stl",
         "mesh:BASE/here/pipe.stl:0.1",
@@ -117,10 +139,23 @@ HOSTILE = (
         "pipe.stl",
         "BASE/here/pipe.stl",
     ),
-    *("file://BASE/here/evil.py", "hf://here/evil", "panda", "so101.yaml", "reach", "mesh", "any", "box:0.05"),
+    *(
+        "file://BASE/here/evil.py",
+        "hf://here/evil",
+        "panda",
+        "so101.yaml",
+        "reach",
+        "mesh",
+        "any",
+        "box:0.05",
+    ),
 )
-SINGLE = st.sampled_from(HOSTILE) | st.none() | st.booleans() | st.integers(-1, 3) | st.text(max_size=9)
-VALUES = SINGLE | st.lists(SINGLE, max_size=2) | st.dictionaries(st.text(max_size=5), SINGLE, max_size=2)
+SINGLE = (
+    st.sampled_from(HOSTILE) | st.none() | st.booleans() | st.integers(-1, 3) | st.text(max_size=9)
+)
+VALUES = (
+    SINGLE | st.lists(SINGLE, max_size=2) | st.dictionaries(st.text(max_size=5), SINGLE, max_size=2)
+)
 
 
 def places(tree: Any) -> Iterator[tuple[Any, Any]]:
@@ -141,7 +176,9 @@ def test_whatever_a_field_says_no_file_outside_is_opened_run_or_written(file, gi
     everywhere = [*places(tree)]
     names = [place for place in everywhere if place[1] in (*NAMED, "policy", "type")]
     container, key = drawn.draw(st.sampled_from(names or everywhere) | st.sampled_from(everywhere))
-    container[key] = drawn.draw(st.sampled_from(HOSTILE) if drawn.draw(st.integers(0, 3)) else VALUES)
+    container[key] = drawn.draw(
+        st.sampled_from(HOSTILE) if drawn.draw(st.integers(0, 3)) else VALUES
+    )
     path.write_text(json.dumps(tree).replace("BASE", str(given_files)))
     try:
         with nothing_is_touched():
@@ -153,7 +190,10 @@ def test_whatever_a_field_says_no_file_outside_is_opened_run_or_written(file, gi
 
 
 COMMANDS = [
-    *(f"data {what} BASE/data BASE/new --workers=1" for what in ("relabel", "render --cameras=front", "redraw")),
+    *(
+        f"data {what} BASE/data BASE/new --workers=1"
+        for what in ("relabel", "render --cameras=front", "redraw")
+    ),
     *(f"rl {method} --dataset.root=BASE/data --output_dir=BASE/new" for method in ("gail", "airl")),
     "eval BASE/e --replay=4000000",
     "eval --policy.path=BASE/policy --output_dir=BASE/new",
@@ -193,7 +233,9 @@ def test_python_says_that_a_policy_of_ones_own_files_needs_them(field, given_fil
     assert field == "object" or "of a file of your own; give --" in str(caught.value)
 
 
-@pytest.mark.parametrize("words", ["data check DATA", "train --dataset.root=DATA --steps=1 --output_dir=new"])
+@pytest.mark.parametrize(
+    "words", ["data check DATA", "train --dataset.root=DATA --steps=1 --output_dir=new"]
+)
 def test_a_stored_mesh_hangs_nothing(words, given_files, capsys):
     with hostile(given_files, "object"):
         assert main(words.replace("DATA", str(given_files / "data")).split()) == 1

@@ -1,4 +1,6 @@
-"""A study runs what is not there, compares all of it, and says in one line what is wrong with its file."""
+"""A study runs what is not there, compares all of it, and says in one line what is wrong with
+its file.
+"""
 
 import json
 import re
@@ -58,8 +60,12 @@ def test_every_arm_runs_with_every_training_seed_and_its_own_options(here, runs)
     assert study() == 0
     expected = [(seed, method) for seed in range(2) for method in ("cloning", "dagger")]
     assert [(options.settings["seed"], options.method) for options in runs] == expected
-    assert [str(options.output_dir) for options in runs] == [f"s/{method}/seed_{seed}" for seed, method in expected]
-    assert all(options.env["horizon"] == 8 and options.fit["policy"] == {"width": 16} for options in runs)
+    assert [str(options.output_dir) for options in runs] == [
+        f"s/{method}/seed_{seed}" for seed, method in expected
+    ]
+    assert all(
+        options.env["horizon"] == 8 and options.fit["policy"] == {"width": 16} for options in runs
+    )
     assert all(options.resume and options.workers == 1 for options in runs)
 
 
@@ -72,7 +78,11 @@ def test_the_answer_is_printed_and_written(here, runs, capsys):
     assert data["baseline"] == "cloning"
     assert data["rule"] == {"checkpoint": "best", "at": "labels", "limit": 300}
     first = data["arms"]["dagger"]["training_seeds"][0]
-    assert (first["chosen"]["round"], first["first_at_target"]["labels"], first["n_episodes"]) == (2, 300, 2)
+    assert (first["chosen"]["round"], first["first_at_target"]["labels"], first["n_episodes"]) == (
+        2,
+        300,
+        2,
+    )
     assert data["arms"]["cloning"]["training_seeds"][1]["first_at_target"] is None
     page = (here / "s" / "report.html").read_text()
     assert page.count('alt="Validation success over') == 3
@@ -88,7 +98,10 @@ def test_finished_runs_and_evaluations_are_not_made_again(here, runs, evaluated)
     assert [str(options.output_dir) for options in runs[4:]] == ["s/dagger/seed_1"]
     assert len(evaluated) == 4  # its policies came out the same
     assert study("--resume=true", "--training_seeds=3") == 0
-    assert [str(options.output_dir) for options in runs[5:]] == ["s/cloning/seed_2", "s/dagger/seed_2"]
+    assert [str(options.output_dir) for options in runs[5:]] == [
+        "s/cloning/seed_2",
+        "s/dagger/seed_2",
+    ]
     assert evaluated[4:] == ["s/cloning/seed_2", "s/dagger/seed_2"]
 
 
@@ -105,7 +118,9 @@ def test_finished_runs_and_evaluations_are_not_made_again(here, runs, evaluated)
         ("method: cloning", "env.horizon: 9", "horizon differs: cloning has 9, dagger has 8"),
     ],
 )
-def test_a_file_that_is_not_sound_is_one_line_before_anything_runs(before, after, words, here, runs, error):
+def test_a_file_that_is_not_sound_is_one_line_before_anything_runs(
+    before, after, words, here, runs, error
+):
     assert before in FILE
     (here / "x.yaml").write_text(FILE.replace(before, after, 1))
     assert study() in (1, 2)
@@ -130,8 +145,11 @@ def test_the_studies_that_come_along_are_sound_and_say_their_own_commands(tmp_pa
     assert len(paths) >= 5
     for path in paths:
         copy = tmp_path / path.name
-        copy.write_text(re.sub(r"dataset\.root: \w+/[^,}\n]+,? ?", "", path.read_text()))  # which are made before
+        # which are made before
+        copy.write_text(re.sub(r"dataset\.root: \w+/[^,}\n]+,? ?", "", path.read_text()))
         plan = read_plan(copy)
         assert (plan.baseline is None) == (len({env.task for env in plan.envs.values()}) > 1)
         first = path.read_text().splitlines()[0]
-        assert first == f"# manip-il compare configs/studies/{path.name} --output_dir=runs/{path.stem}"
+        assert (
+            first == f"# manip-il compare configs/studies/{path.name} --output_dir=runs/{path.stem}"
+        )

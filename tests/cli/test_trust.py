@@ -1,4 +1,7 @@
-"""`--trust` is said on the command line alone, to every command that loads a policy; and what `--policy.path` means."""
+"""`--trust` is said on the command line alone, to every command that loads a policy.
+
+And what `--policy.path` means.
+"""
 
 import json
 import re
@@ -49,8 +52,13 @@ def named(tmp_path) -> Path:
     return folder
 
 
-def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, policy, tmp_path, error):
-    out, file = f"--output_dir={tmp_path / 'out'}", make_eval(tmp_path / "e" / "eval.json", [True, False])
+def test_what_a_checkpoint_names_is_refused_by_every_command(
+    hostile, named, policy, tmp_path, error
+):
+    out, file = (
+        f"--output_dir={tmp_path / 'out'}",
+        make_eval(tmp_path / "e" / "eval.json", [True, False]),
+    )
     words = ["--env.horizon=8", "--workers=1", out]
     for command in (
         ["eval", f"--policy.path={hostile}", "--eval.n_episodes=1", *words],
@@ -76,7 +84,9 @@ def test_no_file_may_say_it_and_the_resolved_options_do_not(command, tmp_path):
     assert said.trust is True  # pyright: ignore[reportAttributeAccessIssue]
     assert "trust" not in dump_yaml(said)
     (tmp_path / "c.yaml").write_text("trust: true\n")
-    with pytest.raises(UsageError, match=r"c\.yaml: trust can only be set on the command line; give --trust="):
+    with pytest.raises(
+        UsageError, match=r"c\.yaml: trust can only be set on the command line; give --trust="
+    ):
         parse(cls, [*REQUIRED.get(command, []), f"--config_path={tmp_path / 'c.yaml'}"])
 
 
@@ -97,7 +107,10 @@ def test_a_run_means_its_best_policy_else_its_newest(tmp_path, policy):
     assert find_policy(run) == run / "best" / "pretrained_model"
     shutil.rmtree(run / "best")
     for newest in ("round_002", "round_001"):
-        assert find_policy(run) == run / newest / "policy" / "checkpoints" / "last" / "pretrained_model"
+        assert (
+            find_policy(run)
+            == run / newest / "policy" / "checkpoints" / "last" / "pretrained_model"
+        )
         shutil.rmtree(run / newest)
 
 
@@ -115,5 +128,11 @@ def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, 
     run = make_run(here / "run", policy)
     task = ["--task.type=reach"] if command == "dagger" else []
     options = parse(load(command), [*REQUIRED.get(command, []), *task, "--policy.path=run"])
-    fit = dagger_config(options).fit if command == "dagger" else FitConfig(with_folder(options.fit["policy"]))
-    assert Path(lerobot_options(fit)[0].policy.pretrained_path).resolve() == find_policy(run).resolve()
+    fit = (
+        dagger_config(options).fit
+        if command == "dagger"
+        else FitConfig(with_folder(options.fit["policy"]))
+    )
+    assert (
+        Path(lerobot_options(fit)[0].policy.pretrained_path).resolve() == find_policy(run).resolve()
+    )

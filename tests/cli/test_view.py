@@ -37,7 +37,11 @@ def column(path: Path, entity: str, component: str) -> list[Any]:
     for chunk in RrdReader(path).stream():
         if chunk.entity_path == f"/{entity}" and not chunk.is_static:
             batch = chunk.to_record_batch().to_pydict()
-            rows |= {f: v for f, v in zip(batch[FRAME], batch.get(component, []), strict=False) if v is not None}
+            rows |= {
+                f: v
+                for f, v in zip(batch[FRAME], batch.get(component, []), strict=False)
+                if v is not None
+            }
     return [rows[frame] for frame in sorted(rows)]
 
 
@@ -63,14 +67,19 @@ def test_a_file_holds_every_step_and_a_picture_of_every_camera(tmp_path, capsys)
         shown = np.array(column(path, name, SCALARS)).astype(recorded.dtype)
         np.testing.assert_array_equal(shown, recorded)
     progress = np.array(column(path, schema.PROGRESS, SCALARS)).ravel()
-    recorded = np.concatenate([episode.columns[schema.PROGRESS].ravel() for episode in episodes]).astype(float)
+    recorded = np.concatenate(
+        [episode.columns[schema.PROGRESS].ravel() for episode in episodes]
+    ).astype(float)
     np.testing.assert_allclose(progress, recorded, atol=1e-6)
     events = [line for [line] in column(path, "events", TEXT)]
     assert events == [f"seed {3_000_000 + i}: solved, {steps[i]} steps" for i in range(2)]
     assert f"/{schema.EXPERT_PHASE}" in entities(path)
     for camera in CAMERAS:
         pictures = column(path, schema.IMAGES + camera, "EncodedImage:blob")
-        assert [bytes(np.array(one, np.uint8).ravel()[:2]) for one in pictures] == [b"\xff\xd8"] * sum(steps)  # JPEG
+        # JPEG
+        assert [bytes(np.array(one, np.uint8).ravel()[:2]) for one in pictures] == [
+            b"\xff\xd8"
+        ] * sum(steps)
 
 
 def test_the_sliders_of_the_window_drive_from_where_an_episode_starts():
@@ -88,6 +97,10 @@ def test_the_sliders_of_the_window_drive_from_where_an_episode_starts():
     steps = list(run_steps(job, [env], [3_000_000], slider_actions(window, env)))
     begun = steps[0].executed_action[scene.actions.arm]
     assert not np.isclose(begun, window.commands[scene.arm_ctrl]).any()
-    np.testing.assert_allclose(steps[-1].executed_action[scene.actions.arm], window.commands[scene.arm_ctrl])
+    np.testing.assert_allclose(
+        steps[-1].executed_action[scene.actions.arm], window.commands[scene.arm_ctrl]
+    )
     np.testing.assert_allclose(env.data.ctrl[scene.gripper.ctrl], 0.03, atol=1e-6)
-    np.testing.assert_allclose(env.data.qpos[scene.arm_q], window.commands[scene.arm_ctrl], atol=5e-3)
+    np.testing.assert_allclose(
+        env.data.qpos[scene.arm_q], window.commands[scene.arm_ctrl], atol=5e-3
+    )

@@ -8,7 +8,15 @@ from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import env_spec
 
 
-def clone(env: EnvConfig, episodes: int, folder: Path, *, steps: int, width: int = 32, batch_size: int = 32) -> Path:
+def clone(
+    env: EnvConfig,
+    episodes: int,
+    folder: Path,
+    *,
+    steps: int,
+    width: int = 32,
+    batch_size: int = 32,
+) -> Path:
     """Write a policy of `env`, fitted to so many of the expert's episodes, into a folder."""
     from manip_il.data.dataset import Dataset
     from manip_il.data.lerobot_write import write_dataset

@@ -1,4 +1,6 @@
-"""What workers do with an episode in these tests (imported by name in their processes), and what is left of it."""
+"""What workers do with an episode in these tests (imported by name in their processes), and what
+is left of it.
+"""
 
 from __future__ import annotations
 
@@ -30,12 +32,18 @@ def written(episodes: Iterable[Episode]) -> dict[int, dict[str, bytes]]:
 def label_all(piece: tuple[EnvConfig, Episode]) -> dict[str, Any]:
     """Labels of an episode's states, the last one first."""
     env, episode = piece
-    return {key: column[::-1] for key, column in label_states(env, episode.columns[SIM_STATE][::-1]).items()}
+    return {
+        key: column[::-1]
+        for key, column in label_states(env, episode.columns[SIM_STATE][::-1]).items()
+    }
 
 
 @dataclass(frozen=True)
 class DeadlyJournal(Journal):
-    """The process that packs one of `seeds` is killed, at most `times` times a seed; deaths are counted in `grave`."""
+    """The process that packs one of `seeds` is killed, at most `times` times a seed.
+
+    Deaths are counted in `grave`.
+    """
 
     grave: Path
     seeds: tuple[int, ...]
@@ -45,7 +53,9 @@ class DeadlyJournal(Journal):
     def of(cls, folder: Path, job: RolloutJob, *seeds: int, times: int = 1000) -> DeadlyJournal:
         (folder / "deaths").mkdir()
         journal = journal_of(folder / "journals", job)
-        return cls(journal.folder, journal.spec, journal.fingerprint, folder / "deaths", seeds, times)
+        return cls(
+            journal.folder, journal.spec, journal.fingerprint, folder / "deaths", seeds, times
+        )
 
     def encode(self, episode: Episode) -> bytes:
         if episode.seed in self.seeds and self.deaths(episode.seed) < self.times:

@@ -31,7 +31,9 @@ class Teacher:
 
 
 class Diary:
-    """A policy of one answer that notes what it is told: who begins and of what, whose rows, what pictures."""
+    """A policy of one answer that notes what it is told: who begins and of what, whose rows,
+    what pictures.
+    """
 
     cameras = ("front",)
 
@@ -48,7 +50,9 @@ class Diary:
 
 def turn(seed: int = 0, step: int = 0, value: float = 0.0, teacher: Teacher | None = None) -> Turn:
     images = {name: np.full((2, 2, 3), seed + step, np.uint8) for name in ("front", "wrist")}
-    observation = Observation(np.full(3, value, np.float32), np.zeros(2, np.float32), images, f"do {seed}")
+    observation = Observation(
+        np.full(3, value, np.float32), np.zeros(2, np.float32), images, f"do {seed}"
+    )
     return Turn(seed, step, observation, STATE, teacher)
 
 
@@ -66,11 +70,15 @@ def test_a_random_driver_stays_within_its_reach():
     actions = scene_of("panda", "reach").actions
     drive = RandomDriver().start(Setting(actions, 15))
     state = np.asarray([*np.linspace(-1, 1, 7), 0.04], np.float32)
-    turns = [Turn(seed, 0, Observation(state, np.zeros(0, np.float32)), STATE) for seed in range(99)]
+    turns = [
+        Turn(seed, 0, Observation(state, np.zeros(0, np.float32)), STATE) for seed in range(99)
+    ]
     drawn = np.array([[action for action, _ in drive(turns)] for _ in range(2)])
     assert (np.abs(drawn - state) <= actions.scale + 1e-6)[..., actions.arm].all()
     opening = drawn[..., actions.gripper]
-    assert ((opening >= actions.low[actions.gripper]) & (opening <= actions.high[actions.gripper])).all()
+    assert (
+        (opening >= actions.low[actions.gripper]) & (opening <= actions.high[actions.gripper])
+    ).all()
     assert (drawn[0] != drawn[1]).any(axis=1).all()
 
 
@@ -98,7 +106,8 @@ def test_an_ensemble_queries_where_its_members_spread():
     gate = Query("ensemble", 0.2).start(setting(None, *others))
     agreed, alone = np.array([0.0, 0.0, 0.08]), np.array([0.09, 0.0, 0.08])
     assert gate([turn(7), turn(8, step=3)], [agreed, alone]) == [False, True]
-    assert [member.notes[0] for member in others] == [("begin", {7: "do 7"})] * 2  # a memory must know who begins
+    # a memory must know who begins
+    assert [member.notes[0] for member in others] == [("begin", {7: "do 7"})] * 2
 
 
 def test_chance_queries_in_its_share_of_the_steps_and_the_same_for_a_seed():

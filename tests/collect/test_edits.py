@@ -1,4 +1,6 @@
-"""Datasets made of stored states: labels are the expert's, pictures those of recording, scenes sound."""
+"""Datasets made of stored states: labels are the expert's, pictures those of recording, scenes
+sound.
+"""
 
 import math
 from contextlib import closing
@@ -54,7 +56,11 @@ def recorded(env: EnvConfig, count: int = 2, **settings) -> list[Episode]:
 
 
 def write(
-    episodes: list[Episode], root: Path, env: EnvConfig, cameras: CameraConfig | None = None, **provenance
+    episodes: list[Episode],
+    root: Path,
+    env: EnvConfig,
+    cameras: CameraConfig | None = None,
+    **provenance,
 ) -> Path:
     about = {"fingerprint": env_fingerprint(env, cameras), "provenance": {"round": 3, **provenance}}
     write_dataset(episodes, root, env_spec(env, cameras), **about)
@@ -89,19 +95,28 @@ def test_labels_given_afterwards_elsewhere_in_another_order_are_those_given_whil
     with closing(map_in_order(label_all, pieces, 2)) as labelled:
         for (_, episode), found in labelled:
             for key, labels in found.items():
-                np.testing.assert_array_equal(labels.reshape(episode.columns[key].shape), episode.columns[key])
+                np.testing.assert_array_equal(
+                    labels.reshape(episode.columns[key].shape), episode.columns[key]
+                )
 
 
-@pytest.mark.parametrize("env", [REACH, make_config("fetch_stock", "FetchReach-v4")], ids=lambda env: env.robot)
+@pytest.mark.parametrize(
+    "env", [REACH, make_config("fetch_stock", "FetchReach-v4")], ids=lambda env: env.robot
+)
 def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvConfig, tmp_path):
     [first, second] = recorded(env)
     older = {key: first.columns[key].copy() for key in (schema.ACTION, schema.EXPERT_PHASE)}
     older[schema.ACTION][:2, 0] += np.array([0.05, 1e-5])  # the second is nothing to speak of
     older[schema.EXPERT_PHASE][1] += 1
-    bare = {key: np.zeros_like(second.columns[key]) for key in (schema.ACTION, schema.LABEL_VALID, schema.EXPERT_PHASE)}
+    bare = {
+        key: np.zeros_like(second.columns[key])
+        for key in (schema.ACTION, schema.LABEL_VALID, schema.EXPERT_PHASE)
+    }
     root = write([changed(first, **older), changed(second, **bare)], tmp_path / "older", env)
     whole = write([first, second], tmp_path / "whole", env)
-    assert relabel_dataset(open_source(root), EditTarget(tmp_path / "new", workers=2)) == 2 + len(second)
+    assert relabel_dataset(open_source(root), EditTarget(tmp_path / "new", workers=2)) == 2 + len(
+        second
+    )
     new, expected = Dataset.open(tmp_path / "new"), Dataset.open(whole)
     for key, column in expected.columns().items():
         np.testing.assert_array_equal(new.columns()[key], column)
@@ -114,7 +129,10 @@ def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvC
 def test_pictures_made_afterwards_are_those_made_while_recording(robot: str):
     env = make_config(robot)
     for episode in recorded(env, 1, cameras=CAMERAS):
-        pictures, spec = render_states(env, CAMERAS, episode.columns[schema.SIM_STATE]), env_spec(env, CAMERAS)
+        pictures, spec = (
+            render_states(env, CAMERAS, episode.columns[schema.SIM_STATE]),
+            env_spec(env, CAMERAS),
+        )
         assert set(pictures) == {*spec.image_keys, *spec.keypoint_keys}
         for key, frames in pictures.items():
             np.testing.assert_array_equal(frames, episode.columns[key])
@@ -142,7 +160,9 @@ def test_a_dataset_gets_other_pictures_and_keeps_everything_else(demos, tmp_path
                 assert np.abs(episode.columns[key].astype(int) - exact[key]).mean() < 4
 
 
-def redrawn(source: EditSource, root: Path, frames: int, workers: int = 1, **settings) -> list[Episode]:
+def redrawn(
+    source: EditSource, root: Path, frames: int, workers: int = 1, **settings
+) -> list[Episode]:
     redraw_dataset(source, Scenes(SMALL, frames, **settings), EditTarget(root, workers))
     return list(read_episodes(root))
 
@@ -160,18 +180,28 @@ def world_in(world: World, state: State) -> World:
 
 @pytest.mark.gl
 @pytest.mark.parametrize(("robot", "task"), one_arm_per_task())
-def test_redrawn_scenes_are_other_scenes_around_the_same_hand_with_the_experts_label(robot: str, task: str, tmp_path):
+def test_redrawn_scenes_are_other_scenes_around_the_same_hand_with_the_experts_label(
+    robot: str, task: str, tmp_path
+):
     env, scene = make_config(robot, task), scene_of(robot, task)
     source = open_source(write(recorded(env, 1, conditions=(NOISE,)), tmp_path / "visited", env))
-    frames, expert, world = CHUNK if task != "pick_place" else 2 * CHUNK, Expert(scene), World(scene)
+    frames, expert, world = (
+        CHUNK if task != "pick_place" else 2 * CHUNK,
+        Expert(scene),
+        World(scene),
+    )
     episodes = redrawn(source, tmp_path / "new", frames)
-    hands = {tuple(world_in(world, state).data.qpos[scene.arm_q]): state for state in originals(source)}
+    hands = {
+        tuple(world_in(world, state).data.qpos[scene.arm_q]): state for state in originals(source)
+    }
     anew, moved = 0, 0
     for episode in episodes:
         state = State.from_vector(episode.columns[schema.SIM_STATE][0])
         label = expert.label(state)
         assert len(episode) == label.valid == 1
-        np.testing.assert_array_equal(label.action.astype(np.float32), episode.columns[schema.ACTION][0])
+        np.testing.assert_array_equal(
+            label.action.astype(np.float32), episode.columns[schema.ACTION][0]
+        )
         before = hands[tuple(world_in(world, state).data.qpos[scene.arm_q])]
         anew += not np.array_equal(state.physics, before.physics)
         for name, one in scene.objects.items() if task == "pick_place" else ():
@@ -179,7 +209,11 @@ def test_redrawn_scenes_are_other_scenes_around_the_same_hand_with_the_experts_l
             mujoco.mj_collision(world.model, world_in(world, state).data)
             if math.dist(was, world.pose(name).position):
                 assert not held
-                assert all(contact.dist > -2e-3 for contact in world.data.contact if one.geom in contact.geom)
+                assert all(
+                    contact.dist > -2e-3
+                    for contact in world.data.contact
+                    if one.geom in contact.geom
+                )
                 moved += 1
     assert len(episodes) > 0.8 * frames
     assert anew >= len(episodes) / 5  # a hand at the furniture leaves it alone
@@ -208,7 +242,9 @@ def test_redrawn_scenes_are_observed_with_noise(visited, tmp_path):
     env = env_of(visited.env)
     for scene in read_episodes(tmp_path / "noisy"):
         env.set_state(State.from_vector(scene.columns["sim_state"][0]))
-        assert 0.01 < np.abs(scene.columns["observation.state"][0] - env.observe().state).max() < 0.5
+        assert (
+            0.01 < np.abs(scene.columns["observation.state"][0] - env.observe().state).max() < 0.5
+        )
 
 
 @pytest.mark.gl
@@ -217,7 +253,10 @@ def test_redrawing_depends_on_the_seed_alone_and_more_frames_begin_with_the_same
     once = redrawn(visited, tmp_path / "1" / "new", CHUNK + 3)
     redrawn(visited, tmp_path / "2" / "new", CHUNK + 3, workers=2)
     assert digests(tmp_path / "1" / "new") == digests(tmp_path / "2" / "new")
-    more, other = redrawn(visited, tmp_path / "more", 2 * CHUNK), redrawn(visited, tmp_path / "other", 5, seed=1)
+    more, other = (
+        redrawn(visited, tmp_path / "more", 2 * CHUNK),
+        redrawn(visited, tmp_path / "other", 5, seed=1),
+    )
     for one, same in zip(once, more, strict=False):
         for key in (schema.ACTION, schema.SIM_STATE, schema.IMAGES + "wrist"):
             np.testing.assert_array_equal(one.columns[key], same.columns[key])
@@ -232,8 +271,12 @@ def test_a_branch_is_the_experts_next_steps_and_looks_are_those_of_the_state(vis
     env, colours = env_of(ENV, SMALL), set()
     for one, three in zip(single, branches, strict=True):
         assert (len(one), len(three)) == (1, 3)
-        np.testing.assert_array_equal(one.columns[schema.ACTION][0], three.columns[schema.ACTION][0])
-        np.testing.assert_array_equal(three.columns[schema.ACTION], three.columns[schema.EXECUTED_ACTION])
+        np.testing.assert_array_equal(
+            one.columns[schema.ACTION][0], three.columns[schema.ACTION][0]
+        )
+        np.testing.assert_array_equal(
+            three.columns[schema.ACTION], three.columns[schema.EXECUTED_ACTION]
+        )
         env.set_state(State.from_vector(one.columns[schema.SIM_STATE][0]))
         for camera, picture in env.observe().images.items():
             np.testing.assert_array_equal(picture, one.columns[schema.IMAGES + camera][0])
@@ -241,4 +284,6 @@ def test_a_branch_is_the_experts_next_steps_and_looks_are_those_of_the_state(vis
     assert len(colours) == 4
     kept = redrawn(visited, tmp_path / "kept", 5, anew=False)
     for episode, original in zip(kept, originals(visited), strict=False):
-        np.testing.assert_array_equal(State.from_vector(episode.columns[schema.SIM_STATE][0]).physics, original.physics)
+        np.testing.assert_array_equal(
+            State.from_vector(episode.columns[schema.SIM_STATE][0]).physics, original.physics
+        )

@@ -1,4 +1,6 @@
-"""The expert is a function of the state: continuous within a rung, never a jump, silent where it knows nothing."""
+"""The expert is a function of the state: continuous within a rung, never a jump, silent where it
+knows nothing.
+"""
 
 from dataclasses import replace
 from functools import cache, lru_cache
@@ -36,12 +38,20 @@ def visited_states(robot: str, task: str, driver: str) -> tuple[State, ...]:
     """States of two episodes that a driver visited."""
     config = make_config(robot, task, horizon=40)
     conditions = tuple(sizes_of(task)) if driver == "varied" else ()
-    episodes = RolloutJob(config, driver_of(driver), hold=3, conditions=conditions).run(stream_seeds("certificate", 2))
-    return tuple(State.from_vector(row) for episode in episodes for row in episode.columns["sim_state"])
+    episodes = RolloutJob(config, driver_of(driver), hold=3, conditions=conditions).run(
+        stream_seeds("certificate", 2)
+    )
+    return tuple(
+        State.from_vector(row) for episode in episodes for row in episode.columns["sim_state"]
+    )
 
 
 def written(label: Label) -> bytes:
-    return label.action.tobytes() + np.float64(label.residual).tobytes() + bytes([label.phase, label.valid])
+    return (
+        label.action.tobytes()
+        + np.float64(label.residual).tobytes()
+        + bytes([label.phase, label.valid])
+    )
 
 
 world_of = lru_cache(SCENES_KEPT)(World)
@@ -75,7 +85,9 @@ def test_a_label_read_off_a_running_world_is_that_of_its_state(robot: str, task:
     conditions = (*(sizes_of(task) if driver == "varied" else ()), *([knocked] if knocked else ()))
     config, expert = make_config(robot, task, horizon=30), expert_of(robot, task)
     job = RolloutJob(config, driver_of(driver), hold=3, conditions=conditions)
-    for step in run_steps(job, [make_env(config, None, conditions)], stream_seeds("certificate", 2)):
+    for step in run_steps(
+        job, [make_env(config, None, conditions)], stream_seeds("certificate", 2)
+    ):
         assert step.label is not None
         assert written(step.label) == written(expert.label(step.state))
 
@@ -87,7 +99,9 @@ def test_a_label_is_a_step_that_the_arm_can_make(robot: str, task: str, driver: 
     actions = scene.actions
     for state in visited_states(robot, task, driver):
         label = expert.label(state)
-        (low, _), (high, _), (wanted, _) = (actions.split(one) for one in (actions.low, actions.high, label.action))
+        (low, _), (high, _), (wanted, _) = (
+            actions.split(one) for one in (actions.low, actions.high, label.action)
+        )
         q = np.clip(joints(scene, state), low, high)
         assert np.abs(wanted - q).max() <= scene.robot.max_joint_step + 1e-9
         assert (actions.low <= label.action).all()
@@ -98,13 +112,18 @@ def test_a_label_is_a_step_that_the_arm_can_make(robot: str, task: str, driver: 
 
 @pytest.mark.parametrize("driver", DRIVERS)
 @every_scene_with_a_cube
-def test_within_a_rung_the_label_follows_the_object_continuously(robot: str, task: str, driver: str):
+def test_within_a_rung_the_label_follows_the_object_continuously(
+    robot: str, task: str, driver: str
+):
     expert, scene, rng = expert_of(robot, task), scene_of(robot, task), np.random.default_rng(0)
     compared, size = 0, 1e-5
     states = visited_states(robot, task, driver)
     for state in states:
         move = rng.normal(size=3)
-        label, near = expert.label(state), expert.label(with_object(scene, state, move * size / np.linalg.norm(move)))
+        label, near = (
+            expert.label(state),
+            expert.label(with_object(scene, state, move * size / np.linalg.norm(move))),
+        )
         if label.phase == near.phase:
             compared += 1
             (there, _), (here, _) = (scene.actions.split(one.action) for one in (near, label))
@@ -113,10 +132,13 @@ def test_within_a_rung_the_label_follows_the_object_continuously(robot: str, tas
 
 
 @pytest.mark.parametrize(
-    ("move", "reason"), [((1.0, 0, 0), "object out of reach"), ((0, 0, -0.3), "object off the table")]
+    ("move", "reason"),
+    [((1.0, 0, 0), "object out of reach"), ((0, 0, -0.3), "object off the table")],
 )
 @every_scene_with_a_cube
-def test_where_there_is_no_sound_label_the_arm_holds_still(robot: str, task: str, move, reason: str):
+def test_where_there_is_no_sound_label_the_arm_holds_still(
+    robot: str, task: str, move, reason: str
+):
     expert, scene = expert_of(robot, task), scene_of(robot, task)
     state = with_object(scene, visited_states(robot, task, "expert")[3], np.array(move, float))
     label = expert.label(state)

@@ -32,7 +32,10 @@ JOBS = {
     "noisy expert": {"driver": NoisyExpertDriver(NOISE)},
     "random": {"driver": RandomDriver()},
     "mixture": {"beta": 0.5},
-    "policy of chunks": {"conditions": suite_conditions("all", make_config(), sees=False), "batch": 3},
+    "policy of chunks": {
+        "conditions": suite_conditions("all", make_config(), sees=False),
+        "batch": 3,
+    },
     "probability": {"query": Query("probability", 0.3)},
     "takeover": {"label": "takeover", "query": ONE},
     "branch": {"label": "branch", "query": ONE, "branch_steps": 4},
@@ -63,10 +66,14 @@ def is_the_experts(episode: Episode) -> None:
 
 
 @pytest.mark.parametrize("name", JOBS)
-def test_labels_are_the_experts_and_an_episode_depends_on_its_seed_alone(job: RolloutJob, name: str, tmp_path: Path):
+def test_labels_are_the_experts_and_an_episode_depends_on_its_seed_alone(
+    job: RolloutJob, name: str, tmp_path: Path
+):
     changes = dict(JOBS[name])
     if name == "policy of chunks":  # whose memory could leak from one episode into another
-        changes["driver"] = PolicyDriver.of(write_checkpoint(tmp_path / "act", "act", env_spec(ENV)))
+        changes["driver"] = PolicyDriver.of(
+            write_checkpoint(tmp_path / "act", "act", env_spec(ENV))
+        )
     elif name == "mixture":
         changes = {"driver": replace(job.driver, **changes)}
     job = replace(job, **changes)
@@ -76,7 +83,9 @@ def test_labels_are_the_experts_and_an_episode_depends_on_its_seed_alone(job: Ro
         is_the_experts(episode)
         for part in parts(episode):
             wanted = {"seed": episode.seed, "round": job.round, "beta": job.driver.beta}
-            assert {key: {*part.columns[key].flat} for key in wanted} == {key: {one} for key, one in wanted.items()}
+            assert {key: {*part.columns[key].flat} for key in wanted} == {
+                key: {one} for key, one in wanted.items()
+            }
     bits = written(together.values())
     assert len({columns["executed_action"] for columns in bits.values()}) == len(SEEDS)
     assert written(job.run(SEEDS[2:3])) == {SEEDS[2]: bits[SEEDS[2]]}
@@ -97,7 +106,9 @@ def test_a_rule_changes_nothing_but_where_there_are_labels(job: RolloutJob, quer
         np.testing.assert_array_equal(columns["executed_action"], alone["executed_action"])
         assert (queried <= labelled(free[episode.seed])).all()
         assert (columns["expert_phase"].ravel()[~queried] == 0).all()
-        np.testing.assert_array_equal(columns["action"][~queried], columns["executed_action"][~queried])
+        np.testing.assert_array_equal(
+            columns["action"][~queried], columns["executed_action"][~queried]
+        )
 
 
 def test_a_takeover_is_the_learners_path_and_the_experts_recovery(job: RolloutJob):
@@ -122,14 +133,18 @@ def test_what_an_expert_solves_is_not_the_learners_even_if_it_never_drove(job: R
 
 
 def test_branches_are_observed_with_the_noise_of_the_run(job: RolloutJob):
-    noisy = replace(job, label="branch", query=SELDOM, conditions=(Condition("noise", joint_noise=0.05),))
+    noisy = replace(
+        job, label="branch", query=SELDOM, conditions=(Condition("noise", joint_noise=0.05),)
+    )
     for episode in run(noisy).values():
         _, *branches = parts(episode)
         states = [State.from_vector(one.columns["sim_state"][0]) for one in branches]
         env = env_of(ENV)
         for one, state in zip(branches, states, strict=True):
             env.set_state(state)
-            assert 0.01 < np.abs(one.columns["observation.state"][0] - env.observe().state).max() < 0.5
+            assert (
+                0.01 < np.abs(one.columns["observation.state"][0] - env.observe().state).max() < 0.5
+            )
 
 
 def test_branches_begin_in_visited_states_and_the_learner_goes_on(job: RolloutJob):
@@ -146,5 +161,7 @@ def test_branches_begin_in_visited_states_and_the_learner_goes_on(job: RolloutJo
             assert len(branch) == 5
             assert branch.columns["sim_state"][0].tobytes() in visited
             assert (branch.columns["actor"] == Actor.EXPERT).all()
-            np.testing.assert_array_equal(branch.columns["executed_action"], branch.columns["action"])
+            np.testing.assert_array_equal(
+                branch.columns["executed_action"], branch.columns["action"]
+            )
         assert episode.success == path.success

@@ -1,4 +1,6 @@
-"""A dataset that somebody has added columns and texts to keeps them through everything that rewrites it."""
+"""A dataset that somebody has added columns and texts to keeps them through everything that
+rewrites it.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,9 @@ FORCE, NOTE = "force", "note"
 
 
 def add_columns(root: Path) -> None:
-    """Give a dataset two columns, a text for each third of an episode, a table of its own and an operator."""
+    """Give a dataset two columns, a text for each third of an episode, a table of its own and an
+    operator.
+    """
     table = pq.read_table(root / DATA)
     count = len(table)
     force = np.random.default_rng(count).normal(10_000, 0.3, (count, 2)).astype(np.float32)
@@ -37,11 +41,19 @@ def add_columns(root: Path) -> None:
     pq.write_table(pa.table({"subtask": ["grasp"]}), root / "meta/subtasks.parquet")
     episodes = pq.read_table(root / EPISODES)
     rows: list[dict[str, Any]] = episodes.to_pylist()
-    pq.write_table(pa.Table.from_pylist([row | {"tasks": TEXTS, "operator": "Ada"} for row in rows]), root / EPISODES)
+    pq.write_table(
+        pa.Table.from_pylist([row | {"tasks": TEXTS, "operator": "Ada"} for row in rows]),
+        root / EPISODES,
+    )
     added = {FORCE: {"dtype": "float32", "shape": [2], "names": ["x", "y"]}}
     added |= {NOTE: {"dtype": "string", "shape": [1], "names": None}}
-    edit_json(root / layout.INFO, lambda info: info["features"].update(added) or info.update(total_tasks=len(TEXTS)))
-    edit_json(root / layout.STATS, lambda stats: stats.update(to_lists(column_statistics({FORCE: force}))))
+    edit_json(
+        root / layout.INFO,
+        lambda info: info["features"].update(added) or info.update(total_tasks=len(TEXTS)),
+    )
+    edit_json(
+        root / layout.STATS, lambda stats: stats.update(to_lists(column_statistics({FORCE: force})))
+    )
 
 
 def content(root: Path) -> tuple[dict[str, Any], list[str]]:
@@ -49,7 +61,9 @@ def content(root: Path) -> tuple[dict[str, Any], list[str]]:
     dataset = Dataset.open(root)
     names = [key for key in dataset.stored_features if key not in dataset.cameras]
     table = dataset.columns([*names, "task_index"])
-    return {key: table[key].tolist() for key in names}, [dataset.tasks[one] for one in table["task_index"].tolist()]
+    return {key: table[key].tolist() for key in names}, [
+        dataset.tasks[one] for one in table["task_index"].tolist()
+    ]
 
 
 def run(*words: object) -> None:
@@ -83,14 +97,18 @@ def test_columns_and_texts_survive_a_merge_new_labels_and_mcap(somebodys, tmp_pa
     for root in (both, new):
         assert [row["operator"] for row in Dataset.open(root).episodes.others] == ["Ada", "Ada"]
         assert pq.read_table(root / "meta/subtasks.parquet").to_pydict() == {"subtask": ["grasp"]}
-        assert Dataset.open(root).statistics[FORCE]["std"] == pytest.approx(np.std(expected[0][FORCE], axis=0))
+        assert Dataset.open(root).statistics[FORCE]["std"] == pytest.approx(
+            np.std(expected[0][FORCE], axis=0)
+        )
 
 
 @pytest.mark.gl
 def test_columns_and_texts_survive_other_pictures(somebodys, tmp_path):
     from manip_il.collect.edits import EditTarget, open_source, render_dataset
 
-    render_dataset(open_source(somebodys[0]), CameraConfig(("front",), 32, 32), EditTarget(tmp_path / "seen"))
+    render_dataset(
+        open_source(somebodys[0]), CameraConfig(("front",), 32, 32), EditTarget(tmp_path / "seen")
+    )
     columns, texts = content(tmp_path / "seen")
     before, told = content(somebodys[0])
     assert ({key: columns[key] for key in before}, texts) == (before, told)

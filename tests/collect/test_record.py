@@ -1,4 +1,6 @@
-"""Episodes on disk: what is there is not run again, and what comes out depends on the seeds alone."""
+"""Episodes on disk: what is there is not run again, and what comes out depends on the seeds
+alone.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -25,18 +27,25 @@ SEEDS = range(1_000_000, 1_000_012)
 
 
 class Recorded(Engine):
-    """Plays episodes from the real engine, those of `failing` seeds as failures; remembers what it was asked for."""
+    """Plays episodes from the real engine, those of `failing` seeds as failures.
+
+    Remembers what it was asked for.
+    """
 
     def __init__(self, failing: Sequence[int] = ()):
         super().__init__(1)
         self.asked: list[int] = []
         self._failing = set(failing)
 
-    def run(self, job: RolloutJob, seeds: Sequence[int], journal: Journal | None = None) -> Iterator[Episode]:
+    def run(
+        self, job: RolloutJob, seeds: Sequence[int], journal: Journal | None = None
+    ) -> Iterator[Episode]:
         self.asked += seeds
         for episode in job.run(seeds):
             if episode.seed in self._failing:
-                lost = episode.columns | {"next.success": np.zeros_like(episode.columns["next.success"])}
+                lost = episode.columns | {
+                    "next.success": np.zeros_like(episode.columns["next.success"])
+                }
                 episode = Episode(episode.seed, lost, False, False)
             if journal is not None:
                 journal.store(episode.seed, journal.encode(episode))
@@ -47,7 +56,9 @@ def contents(folder: Path) -> list[bytes]:
     return [path.read_bytes() for path in list_episodes(folder)]
 
 
-def test_what_is_there_is_not_run_again_and_what_came_is_on_disk_before_anybody_hears_of_it(tmp_path):
+def test_what_is_there_is_not_run_again_and_what_came_is_on_disk_before_anybody_hears_of_it(
+    tmp_path,
+):
     def stop(episode: Episode) -> None:
         assert list_seeds(tmp_path) == [episode.seed]
         raise KeyboardInterrupt
@@ -67,7 +78,9 @@ def test_an_expert_that_mostly_fails_is_given_up(tmp_path):
 class Shuffled(Recorded):
     """Episodes end in another order than their seeds'."""
 
-    def run(self, job: RolloutJob, seeds: Sequence[int], journal: Journal | None = None) -> Iterator[Episode]:
+    def run(
+        self, job: RolloutJob, seeds: Sequence[int], journal: Journal | None = None
+    ) -> Iterator[Episode]:
         yield from super().run(job, seeds[::-1], journal)
 
 
@@ -80,10 +93,20 @@ def test_journals_of_another_environment_are_not_gone_on_with(tmp_path):
     assert journal_of(tmp_path, JOB).prepare() == []
     list(collect(Recorded(), JOB, SEEDS[:1], tmp_path))
     assert journal_of(tmp_path, JOB).prepare() == []
-    for other in (replace(JOB, env=make_config("panda", "reach")), replace(JOB, cameras=CameraConfig(("front",)))):
+    for other in (
+        replace(JOB, env=make_config("panda", "reach")),
+        replace(JOB, cameras=CameraConfig(("front",))),
+    ):
         with pytest.raises(MismatchError):
             journal_of(tmp_path, other).prepare()
-    assert len(journal_of(tmp_path, replace(JOB, env=make_config("fetch", "reach", tolerance=0.05))).prepare()) == 1
+    assert (
+        len(
+            journal_of(
+                tmp_path, replace(JOB, env=make_config("fetch", "reach", tolerance=0.05))
+            ).prepare()
+        )
+        == 1
+    )
 
 
 def test_a_dataset_recorded_as_it_goes_is_the_one_built_later(tmp_path):

@@ -15,8 +15,8 @@ GOAL = 3.0
 class Counter:
     """A number that actions add to; solved from `GOAL` on. Before step `kick` it is set back by 5.
 
-    noise: added to every action. stuck: progress grows by a tenth a step up to this one, then by less than counts, and
-    nothing is solved.
+    noise: added to every action. stuck: progress grows by a tenth a step up to this one, then by
+    less than counts, and nothing is solved.
     """
 
     def __init__(self, kick: int = -1, noise: float = 0.0, stuck: int | None = None) -> None:
@@ -38,7 +38,9 @@ class Counter:
     def step(self, action: np.ndarray) -> Outcome:
         self.x += float(action[0]) + self.noise
         self.steps += 1
-        return Outcome(action + self.noise if self.noise else action, float(self.solved), self.solved)
+        return Outcome(
+            action + self.noise if self.noise else action, float(self.solved), self.solved
+        )
 
     def observe(self) -> Observation:
         self.x -= 5.0 * (self.steps == self.kick)
@@ -79,7 +81,9 @@ def always(turns: Sequence[Turn], actions: Sequence[np.ndarray]) -> list[bool]:
     return [True] * len(turns)
 
 
-def one_episode(env: Counter, driver, rules: Rules, gate=always, expert: Ones | None = None) -> list[Transition]:
+def one_episode(
+    env: Counter, driver, rules: Rules, gate=always, expert: Ones | None = None
+) -> list[Transition]:
     return list(rollout([env], [0], driver, rules, expert or Ones(), gate))
 
 
@@ -88,7 +92,12 @@ def test_a_frame_holds_what_was_before_the_step_and_what_came_of_it():
     assert [frame.state.physics[0] for frame in frames] == [0, 1, 2, 3]
     assert [frame.observation.state[0] for frame in frames] == [0, 1, 2, 3]
     assert [frame.progress for frame in frames] == pytest.approx([0, 1 / 3, 2 / 3, 1])
-    assert [(frame.success, frame.reward) for frame in frames] == [(False, 0), (False, 0), (True, 1), (True, 1)]
+    assert [(frame.success, frame.reward) for frame in frames] == [
+        (False, 0),
+        (False, 0),
+        (True, 1),
+        (True, 1),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -110,7 +119,9 @@ def test_an_episode_ends_by_its_rules(env: Counter, rules: Rules, length: int):
 @pytest.mark.parametrize("steps", [[0, 1, 2, 3], [3], []])
 def test_the_expert_is_queried_where_the_gate_says(steps: list[int]):
     expert = Ones()
-    frames = one_episode(Counter(), Halves(), Rules(4), lambda turns, _: [one.step in steps for one in turns], expert)
+    frames = one_episode(
+        Counter(), Halves(), Rules(4), lambda turns, _: [one.step in steps for one in turns], expert
+    )
     assert expert.queried == [frame.step for frame in frames if frame.label is not None] == steps
 
 
@@ -119,7 +130,9 @@ def test_an_expert_that_takes_over_has_a_horizon_more_and_leaves_the_others_alon
         return [(turn.seed, turn.step) == (1, 2) for turn in turns]
 
     learner = Halves()
-    frames = list(rollout([Counter(), Counter()], [0, 1], learner, Rules(5, takeover=True), Ones(), gate))
+    frames = list(
+        rollout([Counter(), Counter()], [0, 1], learner, Rules(5, takeover=True), Ones(), gate)
+    )
     actors = {seed: [frame.actor for frame in frames if frame.seed == seed] for seed in (0, 1)}
     assert actors == {0: [Actor.LEARNER] * 5, 1: [Actor.LEARNER] * 2 + [Actor.EXPERT] * 8}
     assert learner.rows == [2, 2, 2, 1, 1]
@@ -130,7 +143,8 @@ def test_an_expert_that_takes_over_has_a_horizon_more_and_leaves_the_others_alon
     [
         (Counter(), Halves(), 0.5, Actor.LEARNER),
         (Counter(noise=0.1), Halves(), 0.6, Actor.LEARNER),
-        (Counter(noise=0.1), follow, 1.1, Actor.NOISY_EXPERT),  # as its action is changed on its way
+        # as its action is changed on its way
+        (Counter(noise=0.1), follow, 1.1, Actor.NOISY_EXPERT),
     ],
 )
 def test_the_label_is_the_experts_whoever_drove(env, driver, executed: float, actor: Actor):

@@ -1,4 +1,5 @@
-"""The expert gets there with cubes at the ends of their range, and from where a disturbance left it.
+"""The expert gets there with cubes at the ends of their range, and from where a disturbance left
+it.
 
 From the start, in every scene: `tests/tasks/test_every_task.py`.
 """
@@ -22,7 +23,9 @@ def ends(task: str) -> tuple[Condition, ...]:
     sizes = TASKS[task].sizes
     assert sizes is not None
     names = zip(("small", "large"), sizes, (0.3, 0.05), strict=True)
-    return tuple(Condition(name, size=(size, size), mass=(mass, mass)) for name, size, mass in names)
+    return tuple(
+        Condition(name, size=(size, size), mass=(mass, mass)) for name, size, mass in names
+    )
 
 
 CASES = [(*scene, condition) for scene in WITH_A_CUBE for condition in (*ends(scene[1]), KNOCKED)]
@@ -31,16 +34,23 @@ CHANGED = [
     for robot, task in SCENES
     for kind in kinds_for(TASKS[task])
     if KINDS[kind].change is not None
-    for at in ((6, 16) if task == "pick_place" else (6,))  # on the way to the cube; with it in the hand
+    # on the way to the cube; with it in the hand
+    for at in ((6, 16) if task == "pick_place" else (6,))
 ]
 
 
 def failures(condition: Condition, robot: str, task: str, count: int) -> list[int]:
     job = RolloutJob(make_config(robot, task), hold=0, conditions=(condition,))
-    return [episode.seed for episode in job.run(stream_seeds("certificate", count)) if not episode.success]
+    return [
+        episode.seed
+        for episode in job.run(stream_seeds("certificate", count))
+        if not episode.success
+    ]
 
 
-@pytest.mark.parametrize(("robot", "task", "condition"), CASES, ids=lambda case: getattr(case, "name", case))
+@pytest.mark.parametrize(
+    ("robot", "task", "condition"), CASES, ids=lambda case: getattr(case, "name", case)
+)
 def test_the_expert_solves_a_task_whatever_the_cube(robot: str, task: str, condition: Condition):
     assert failures(condition, robot, task, 3) == []
 

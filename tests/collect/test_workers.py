@@ -1,4 +1,6 @@
-"""Where episodes run does not matter, and a worker that dies costs no episode: in processes, and on a Ray cluster."""
+"""Where episodes run does not matter, and a worker that dies costs no episode: in processes, and
+on a Ray cluster.
+"""
 
 import contextlib
 import errno
@@ -62,9 +64,11 @@ def test_a_machine_without_shared_memory_is_named(monkeypatch):
 def cluster(tmp_path_factory) -> Iterator[Cluster]:
     """Two nodes of one core each on this machine, whose workers find `kept`."""
     patch = pytest.MonkeyPatch()
-    patch.chdir(tmp_path_factory.mktemp("cwd"))  # workers on this machine would find its packages there
+    # workers on this machine would find its packages there
+    patch.chdir(tmp_path_factory.mktemp("cwd"))
     patch.setenv("PYTHONPATH", f"{Path(__file__).parent}:{Path(__file__).parents[2]}")
-    quick = {"health_check_initial_delay_ms": 500, "health_check_period_ms": 500}  # a dead node is missed five times
+    # a dead node is missed five times
+    quick = {"health_check_initial_delay_ms": 500, "health_check_period_ms": 500}
     two = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "_system_config": quick})
     two.add_node(num_cpus=1)
     two.wait_for_nodes(PATIENCE)
@@ -85,7 +89,9 @@ def engine(backend: str, request: pytest.FixtureRequest) -> Iterator[Engine]:
 
 @pytest.mark.slow
 @both_backends
-def test_an_episode_is_on_disk_before_it_arrives_with_the_bytes_of_one_process(engine: Engine, tmp_path, expected):
+def test_an_episode_is_on_disk_before_it_arrives_with_the_bytes_of_one_process(
+    engine: Engine, tmp_path, expected
+):
     for episode in engine.run(JOB, SEEDS, journal_of(tmp_path, JOB)):
         assert episode.seed in list_seeds(tmp_path)
     assert contents(tmp_path) == expected
@@ -100,7 +106,9 @@ def test_a_policy_acts_the_same_everywhere(engine: Engine, checkpoint):
 
 @pytest.mark.slow
 @both_backends
-def test_a_seed_runs_again_where_its_worker_died_and_ends_the_run_if_it_dies_alone(engine: Engine, tmp_path, expected):
+def test_a_seed_runs_again_where_its_worker_died_and_ends_the_run_if_it_dies_alone(
+    engine: Engine, tmp_path, expected
+):
     (tmp_path / "once").mkdir()
     once = DeadlyJournal.of(tmp_path / "once", JOB, SEEDS[1], times=1)
     assert sorted(episode.seed for episode in engine.run(JOB, SEEDS, once)) == list(SEEDS)
@@ -161,6 +169,8 @@ def test_a_worker_ignores_ctrl_c_and_ends_with_its_parent():
 @pytest.mark.slow
 def test_results_come_in_the_order_of_the_items_and_a_death_is_told():
     for workers in (1, 2):
-        assert list(map_in_order(abs, range(-9, 0), workers)) == [(item, -item) for item in range(-9, 0)]
+        assert list(map_in_order(abs, range(-9, 0), workers)) == [
+            (item, -item) for item in range(-9, 0)
+        ]
     with pytest.raises(ManipError, match="a worker died"):
         list(map_in_order(os._exit, [1], 2))

@@ -1,4 +1,6 @@
-"""The course's notebooks run from a fresh kernel, and every check in them fails until the reader has done its part."""
+"""The course's notebooks run from a fresh kernel, and every check in them fails until the reader
+has done its part.
+"""
 
 import contextlib
 from collections.abc import Iterator
@@ -54,14 +56,20 @@ def shrink(cells: list[nbformat.NotebookNode]) -> None:
 
 @pytest.fixture(scope="module")
 def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NotebookClient]:
-    """One kernel for all notebooks, as its imports take long; it keeps its files and fetches nothing."""
+    """One kernel for all notebooks, as its imports take long.
+
+    It keeps its files and fetches nothing.
+    """
     folder, empty = str(tmp_path_factory.mktemp("course")), nbformat.v4.new_notebook()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TMPDIR", folder)
         patch.setenv("HF_HUB_OFFLINE", "1")
         patch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
         client = NotebookClient(
-            empty, timeout=SECONDS, startup_timeout=SECONDS, resources={"metadata": {"path": folder}}
+            empty,
+            timeout=SECONDS,
+            startup_timeout=SECONDS,
+            resources={"metadata": {"path": folder}},
         )
         with client.setup_kernel():
             yield client
@@ -93,7 +101,11 @@ def test_a_notebook_runs(name: str, kernel: NotebookClient):
 @pytest.mark.slow
 def test_each_check_fails_on_the_unfilled_cell_and_passes_on_the_solution(kernel: NotebookClient):
     cells, solved, checks = read(EXERCISES).cells, read(SOLUTIONS), 0
-    shrink(solved.cells[1 + max(place for place, cell in enumerate(cells) if tag_of(cell) == "check") :])
+    shrink(
+        solved.cells[
+            1 + max(place for place, cell in enumerate(cells) if tag_of(cell) == "check") :
+        ]
+    )
     begin(kernel, deepcopy(solved))
     for place, (unfilled, cell) in enumerate(zip(cells, solved.cells, strict=True)):
         if tag_of(cell) == "exercise":
@@ -121,10 +133,17 @@ def test_a_notebook_is_small_and_holds_no_output(path: Path):
 
 
 def test_they_use_public_functions_alone():
-    words = [word for path in COURSE.glob("*.ipynb") for cell in read(path.stem).cells for word in imported(cell)]
+    words = [
+        word
+        for path in COURSE.glob("*.ipynb")
+        for cell in read(path.stem).cells
+        for word in imported(cell)
+    ]
     assert set(words) == {"manip_il", "manip_il.chapter.course"}
 
 
 def imported(cell: nbformat.NotebookNode) -> list[str]:
     lines = cell.source.splitlines() if cell.cell_type == "code" else []
-    return [line.split()[1] for line in lines if line.startswith(("from manip_il", "import manip_il"))]
+    return [
+        line.split()[1] for line in lines if line.startswith(("from manip_il", "import manip_il"))
+    ]

@@ -1,4 +1,6 @@
-"""Files and folders are whole or absent, a folder has one writer, and what a disk refuses names the path."""
+"""Files and folders are whole or absent, a folder has one writer, and what a disk refuses names
+the path.
+"""
 
 import errno
 import os
@@ -27,7 +29,9 @@ def test_a_folder_appears_at_the_end_and_not_after_an_error(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_what_is_there_is_not_written_over_unless_asked_and_stays_until_the_new_one_is_whole(tmp_path):
+def test_what_is_there_is_not_written_over_unless_asked_and_stays_until_the_new_one_is_whole(
+    tmp_path,
+):
     root = tmp_path / "root"
     (root / "meta").mkdir(parents=True)
     (root / "old").touch()
@@ -50,7 +54,10 @@ def test_what_is_there_is_not_written_over_unless_asked_and_stays_until_the_new_
 def test_what_a_killed_writer_left_is_not_in_the_next_folder(tmp_path):
     writer = start("new_folder", tmp_path / "root")
     (tmp_path / ".root.partial" / "half").write_text("killed")
-    with pytest.raises(ManipError, match="in use by another process"), new_folder(tmp_path / "root"):
+    with (
+        pytest.raises(ManipError, match="in use by another process"),
+        new_folder(tmp_path / "root"),
+    ):
         pass
     kill(writer)
     with new_folder(tmp_path / "root") as folder:
@@ -82,7 +89,10 @@ def test_somebodys_folder_in_the_place_of_a_new_one_is_spared(tmp_path):
 def test_a_second_writer_is_refused_until_the_first_ends(tmp_path):
     writer = start("exclusive", tmp_path / "root")
     for _ in range(2):
-        with pytest.raises(ManipError, match="in use by another process"), exclusive(tmp_path / "root"):
+        with (
+            pytest.raises(ManipError, match="in use by another process"),
+            exclusive(tmp_path / "root"),
+        ):
             pass
     kill(writer)
     for _ in range(2):
@@ -110,7 +120,10 @@ def test_a_full_disk_names_the_path_whichever_library_writes(tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, limits[1]))
     try:
-        with pytest.raises(ManipError, match=f"cannot write {tmp_path}/new: File"), new_folder(tmp_path / "new") as new:
+        with (
+            pytest.raises(ManipError, match=f"cannot write {tmp_path}/new: File"),
+            new_folder(tmp_path / "new") as new,
+        ):
             save_file({"weights": np.zeros(1_000)}, new / "model.safetensors")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -123,7 +136,9 @@ def start(what: str, root: Path) -> subprocess.Popen[str]:
         f"import pathlib, sys, time; from manip_il.data.atomic import {what}\n"
         f"with {what}(pathlib.Path(sys.argv[1])): print('in', flush=True); time.sleep(3600)"
     )
-    process = subprocess.Popen([sys.executable, "-c", code, str(root)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(root)], stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout is not None
     assert process.stdout.readline() == "in\n"
     return process

@@ -1,4 +1,7 @@
-"""Pictures that are decoded, at once or when they are read, are LeRobot's. It imports torch: some seconds."""
+"""Pictures that are decoded, at once or when they are read, are LeRobot's.
+
+It imports torch: some seconds.
+"""
 
 import os
 from collections.abc import Callable
@@ -23,7 +26,9 @@ SIZE = (64, 96, 3)
 
 
 def record(root: Path, kind: str, episodes: int) -> None:
-    """Episodes of numbers, text and two cameras by LeRobot's own writer. kind: of these, `video` or `image`."""
+    """Episodes of numbers, text and two cameras by LeRobot's own writer. kind: of these, `video`
+    or `image`.
+    """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     table: dict[str, Any] = {
@@ -31,14 +36,26 @@ def record(root: Path, kind: str, episodes: int) -> None:
         "action": {"dtype": "float32", "shape": (2,), "names": {"motors": ["x", "y"]}},
         "note": {"dtype": "string", "shape": (1,), "names": None},
         "flag": {"dtype": "bool", "shape": (1,), "names": None},
-        **{one: {"dtype": kind, "shape": SIZE, "names": ["height", "width", "channels"]} for one in (FRONT, WRIST)},
+        **{
+            one: {"dtype": kind, "shape": SIZE, "names": ["height", "width", "channels"]}
+            for one in (FRONT, WRIST)
+        },
     }
-    dataset: Any = LeRobotDataset.create("a/b", 10, table, root=root, robot_type="so100", use_videos=kind == "video")
+    dataset: Any = LeRobotDataset.create(
+        "a/b", 10, table, root=root, robot_type="so100", use_videos=kind == "video"
+    )
     rng = np.random.default_rng(0)
     for episode in range(episodes):
         for t in range(15 + episode):
-            row: dict[str, Any] = {"task": f"task {episode % 2}", "note": f"frame {t}", "flag": np.array([t % 2 == 0])}
-            row |= {key: rng.normal(size=table[key]["shape"]).astype(np.float32) for key in list(table)[:2]}
+            row: dict[str, Any] = {
+                "task": f"task {episode % 2}",
+                "note": f"frame {t}",
+                "flag": np.array([t % 2 == 0]),
+            }
+            row |= {
+                key: rng.normal(size=table[key]["shape"]).astype(np.float32)
+                for key in list(table)[:2]
+            }
             for camera in (FRONT, WRIST):
                 row[camera] = np.zeros(SIZE, np.uint8)
                 row[camera][:, 5 * t % 80 : 5 * t % 80 + 10, episode % 3] = 255
@@ -49,9 +66,14 @@ def record(root: Path, kind: str, episodes: int) -> None:
 
 @pytest.fixture(scope="module")
 def roots(
-    tmp_path_factory: pytest.TempPathFactory, make_episode: Callable[..., Episode], two: s.EnvironmentSpec
+    tmp_path_factory: pytest.TempPathFactory,
+    make_episode: Callable[..., Episode],
+    two: s.EnvironmentSpec,
 ) -> dict[str, Path]:
-    """Ours with either codec, in several files; what LeRobot records; what it makes of two by aggregating."""
+    """Ours with either codec, in several files; what LeRobot records.
+
+    What it makes of two by aggregating.
+    """
     from lerobot.datasets.aggregate import aggregate_datasets
 
     folder = tmp_path_factory.mktemp("datasets")
@@ -87,4 +109,6 @@ def test_what_is_decoded_at_once_or_when_it_is_read_is_bit_equal_to_what_lerobot
         assert int(theirs["index"]) == row
         for key, values in frames.items():
             assert theirs[key].dtype.is_floating_point
-            np.testing.assert_array_equal((theirs[key] * 255).numpy(), values[row].astype(np.float32))
+            np.testing.assert_array_equal(
+                (theirs[key] * 255).numpy(), values[row].astype(np.float32)
+            )

@@ -71,11 +71,21 @@ def test_statistics_are_those_of_all_frames_and_quantiles_the_means_of_the_episo
     for key, stats in json.loads((root / layout.STATS).read_text()).items():
         values = table[key].astype(np.float64)
         assert stats["count"] == [20]
-        for name, function in (("min", np.min), ("max", np.max), ("mean", np.mean), ("std", np.std)):
-            np.testing.assert_allclose(stats[name], np.atleast_1d(function(values, axis=0)), rtol=1e-12, atol=1e-12)
+        for name, function in (
+            ("min", np.min),
+            ("max", np.max),
+            ("mean", np.mean),
+            ("std", np.std),
+        ):
+            np.testing.assert_allclose(
+                stats[name], np.atleast_1d(function(values, axis=0)), rtol=1e-12, atol=1e-12
+            )
         for name, share in layout.QUANTILES.items():
             parts = np.split(values, ends[:-1])
-            each = [len(part) * np.quantile(part, share, axis=0, method="inverted_cdf") for part in parts]
+            each = [
+                len(part) * np.quantile(part, share, axis=0, method="inverted_cdf")
+                for part in parts
+            ]
             np.testing.assert_allclose(stats[name], np.atleast_1d(sum(each) / 20), atol=1e-12)
 
 
@@ -94,12 +104,17 @@ def test_a_merge_equals_writing_all_episodes(tmp_path, make_episode, spec):
 
 
 @pytest.mark.parametrize("change", [{"robot": "fetch"}, {"task": "reach"}, {"image_size": (8, 8)}])
-def test_a_merge_of_different_robots_tasks_or_pictures_is_refused_naming_both(root, tmp_path, episodes, spec, change):
+def test_a_merge_of_different_robots_tasks_or_pictures_is_refused_naming_both(
+    root, tmp_path, episodes, spec, change
+):
     write_dataset(episodes, tmp_path / "other", dataclasses.replace(spec, **change), **OPTIONS)
     ((what, value),) = change.items()
     with pytest.raises(
         MismatchError,
-        match=rf"{what} differs: .*lift has {re.escape(str(getattr(spec, what)))}, .*other has {re.escape(str(value))}",
+        match=(
+            rf"{what} differs: .*lift has {re.escape(str(getattr(spec, what)))}, .*other has"
+            rf" {re.escape(str(value))}"
+        ),
     ):
         merge_datasets([root, tmp_path / "other"], tmp_path / "merged")
     assert not (tmp_path / "merged").exists()

@@ -1,4 +1,6 @@
-"""What parquet files, statistics and videos would have other readers open or decode is refused in one line."""
+"""What parquet files, statistics and videos would have other readers open or decode is refused
+in one line.
+"""
 
 import json
 import tracemalloc
@@ -28,7 +30,9 @@ PICTURE = encoded(np.full((8, 8, 3), 90, np.uint8))
 
 @pytest.fixture
 def root(tmp_path: Path, episodes: list[Episode], spec: s.EnvironmentSpec) -> Path:
-    """A dataset with a column of pictures, as LeRobot records it: without this program's own file."""
+    """A dataset with a column of pictures, as LeRobot records it: without this program's own
+    file.
+    """
     root = write(episodes, tmp_path / "lift", spec)
     store_pictures(root, KEY, [PICTURE] * sum(map(len, episodes)), (8, 8))
     return root
@@ -43,7 +47,12 @@ def set_first(root: Path, cell: dict[str, Any] | None) -> None:
 
 @pytest.mark.parametrize(
     "cell",
-    [None, {"bytes": None, "path": "reference://x"}, {"bytes": EPS, "path": None}, {"bytes": b"", "path": "/a.png"}],
+    [
+        None,
+        {"bytes": None, "path": "reference://x"},
+        {"bytes": EPS, "path": None},
+        {"bytes": b"", "path": "/a.png"},
+    ],
     ids=["none", "address", "another format", "path"],
 )
 def test_a_cell_without_its_picture_is_followed_by_no_reader(root: Path, cell: Any):
@@ -58,7 +67,8 @@ def test_a_cell_without_its_picture_is_followed_by_no_reader(root: Path, cell: A
 def test_such_a_dataset_is_not_pulled(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     remote = open_remote(f"file://{tmp_path}/store", quiet=True)
     set_first(root, {"bytes": None, "path": "http://127.0.0.1:1/a.png"})
-    monkeypatch.setattr("manip_il.bridges.store.transfer.examine_folder", lambda root: [])  # another program pushed it
+    # another program pushed it
+    monkeypatch.setattr("manip_il.bridges.store.transfer.examine_folder", lambda root: [])
     push(root, remote)
     with pytest.raises(ManipError, match=rf"{DATA}: column '{KEY}' has no PNG or JPEG in row 0"):
         pull(remote, tmp_path / "here")
@@ -70,10 +80,16 @@ def test_a_hidden_decoder_beside_real_pictures_is_refused(root: Path):
     table = pq.read_table(path)
     about = '{"info": {"features": {"tasks": {"_\\u0074ype": "Image"}}}}'
     pq.write_table(table.replace_schema_metadata({"huggingface": about}), path)
-    with pytest.raises(ManipError, match=rf"{EPISODES}: column 'tasks' is decoded as .*; expected plain values"):
+    with pytest.raises(
+        ManipError, match=rf"{EPISODES}: column 'tasks' is decoded as .*; expected plain values"
+    ):
         check_arrived(root)
-    table = table.append_column(KEY, pa.array([{"bytes": PICTURE, "path": None}] * len(table), layout.PICTURE))
-    pq.write_table(table.replace_schema_metadata({"huggingface": about.replace("tasks", KEY)}), path)
+    table = table.append_column(
+        KEY, pa.array([{"bytes": PICTURE, "path": None}] * len(table), layout.PICTURE)
+    )
+    pq.write_table(
+        table.replace_schema_metadata({"huggingface": about.replace("tasks", KEY)}), path
+    )
     with pytest.raises(ManipError, match=rf"{EPISODES}: column '{KEY}' holds struct"):
         check_arrived(root)
 
@@ -112,7 +128,9 @@ def test_a_film_has_the_size_in_info_before_it_is_decoded(
 
 @pytest.mark.slow
 def test_what_lerobot_and_datasets_write_passes(tmp_path: Path):
-    """Language columns, matrices and pictures, written by LeRobot, merged by it, and through pandas."""
+    """Language columns, matrices and pictures, written by LeRobot, merged by it, and through
+    pandas.
+    """
     from lerobot.datasets.aggregate import aggregate_datasets
     from lerobot.datasets.io_utils import write_table_one_row_group_per_episode
     from lerobot.datasets.language import language_events_column_feature, language_feature_info
@@ -130,7 +148,9 @@ def test_what_lerobot_and_datasets_write_passes(tmp_path: Path):
     for _ in range(3):
         film, picture = np.zeros((64, 64, 3), np.uint8), np.zeros((8, 8, 3), np.uint8)
         matrix = np.zeros((2, 3), np.float32)
-        dataset.add_frame({"matrix": matrix, "note": "a", KEY: picture, "film": film, "task": "wipe"})
+        dataset.add_frame(
+            {"matrix": matrix, "note": "a", KEY: picture, "film": film, "task": "wipe"}
+        )
     dataset.save_episode()
     dataset.finalize()
     check_arrived(tmp_path / "one")
@@ -138,12 +158,18 @@ def test_what_lerobot_and_datasets_write_passes(tmp_path: Path):
     check_arrived(tmp_path / "merged")
     call = {"role": "user", "content": "a", "style": "vqa", "camera": KEY, "tool_calls": [{"a": 1}]}
     features = datasets.Features({"language_events": language_events_column_feature()})
-    written: Any = datasets.Dataset.from_dict({"language_events": [[call]] * 3}, features).with_format("arrow")[:]
-    said = pq.read_table(tmp_path / "one" / DATA).append_column("language_events", written.column(0))
+    written: Any = datasets.Dataset.from_dict(
+        {"language_events": [[call]] * 3}, features
+    ).with_format("arrow")[:]
+    said = pq.read_table(tmp_path / "one" / DATA).append_column(
+        "language_events", written.column(0)
+    )
     write_table_one_row_group_per_episode(said, tmp_path / "one" / DATA)
     datasets.Dataset.from_parquet(str(tmp_path / "one" / DATA)).to_parquet(tmp_path / "one" / DATA)
     told = language_feature_info()["language_events"] | {"shape": [1]}
-    edit_json(tmp_path / "one" / layout.INFO, lambda info: info["features"].update(language_events=told))
+    edit_json(
+        tmp_path / "one" / layout.INFO, lambda info: info["features"].update(language_events=told)
+    )
     check_arrived(tmp_path / "one")
     frame = pq.read_table(tmp_path / "one" / EPISODES).to_pandas()
     frame.to_parquet(tmp_path / "one" / EPISODES, index=False)
@@ -164,13 +190,18 @@ def test_a_files_own_metadata_has_nothing_decoded(root: Path, name: str, kind: s
     table = table.append_column("odd", pa.array(rows, layout.PICTURE))
     about = json.dumps({"info": {"features": {"odd": DECODED[kind]}}})
     pq.write_table(table.replace_schema_metadata({"huggingface": about}), root / name)
-    with pytest.raises(ManipError, match=rf"{name}: column 'odd' holds struct.*; expected plain values"):
+    with pytest.raises(
+        ManipError, match=rf"{name}: column 'odd' holds struct.*; expected plain values"
+    ):
         check_arrived(root)
 
 
 def test_a_playlist_is_no_video(tmp_path: Path, two: s.EnvironmentSpec, filmed: list[Episode]):
     root = write(filmed, tmp_path / "film", two)
     path = next(root.glob("videos/**/*.mp4"))
-    path.write_bytes(b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:1/a.ts\n" + path.read_bytes())
+    path.write_bytes(
+        b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:1/a.ts\n"
+        + path.read_bytes()
+    )
     with pytest.raises(ManipError, match=r"\.mp4: Invalid data found"):
         check_arrived(root)

@@ -28,8 +28,12 @@ def seen(spec: s.EnvironmentSpec) -> s.EnvironmentSpec:
 
 
 @pytest.fixture(scope="module")
-def filmed_once(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, seen: s.EnvironmentSpec) -> Path:
-    return write(numbered_episodes(make_episode, seen), tmp_path_factory.mktemp("filmed") / "victim", seen)
+def filmed_once(
+    tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, seen: s.EnvironmentSpec
+) -> Path:
+    return write(
+        numbered_episodes(make_episode, seen), tmp_path_factory.mktemp("filmed") / "victim", seen
+    )
 
 
 @pytest.fixture
@@ -39,10 +43,17 @@ def victim(tmp_path: Path, filmed_once: Path) -> Path:
 
 
 @pytest.fixture
-def attack(tmp_path: Path, make_episode: MakeEpisode, seen: s.EnvironmentSpec, monkeypatch: pytest.MonkeyPatch) -> Path:
+def attack(
+    tmp_path: Path,
+    make_episode: MakeEpisode,
+    seen: s.EnvironmentSpec,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Path:
     """Journals whose only camera has a path for its name."""
     plain = numbered_episodes(make_episode, seen, 1)[0]
-    columns = {key.replace(FRONT, s.IMAGES + HOSTILE): column for key, column in plain.columns.items()}
+    columns = {
+        key.replace(FRONT, s.IMAGES + HOSTILE): column for key, column in plain.columns.items()
+    }
     with monkeypatch.context() as patch:  # a spec that another program made up: nothing checks it
         patch.setattr(s.EnvironmentSpec, "__post_init__", lambda self: None)
         spec = replace(seen, cameras=(HOSTILE,))
@@ -82,10 +93,19 @@ def test_a_spec_refuses_what_it_cannot_be(spec, change, words):
         ({"video_path": "/etc/{chunk_index}{file_index}"}, "video_path is"),
         ({"video_path": "{video_key.__class__}/{chunk_index}"}, "video_path is"),
         ({"video_path": "videos/{chunk_index:9999999999d}"}, "video_path is"),
-        ({"video_path": layout.VIDEO_PATH.replace(".mp4", ".m3u8")}, f"expected '{layout.VIDEO_PATH}'"),
+        (
+            {"video_path": layout.VIDEO_PATH.replace(".mp4", ".m3u8")},
+            f"expected '{layout.VIDEO_PATH}'",
+        ),
         ({"video_path": f"{layout.VIDEO_PATH}\n"}, "video_path is 'videos/"),
-        ({"data_path": "../victim/{chunk_index:03d}/{file_index:03d}.parquet"}, f"expected '{layout.DATA_PATH}'"),
-        ({"features": {"../../secret": {"dtype": "video", "shape": [8, 8, 3]}}}, "a feature is '../../secret'"),
+        (
+            {"data_path": "../victim/{chunk_index:03d}/{file_index:03d}.parquet"},
+            f"expected '{layout.DATA_PATH}'",
+        ),
+        (
+            {"features": {"../../secret": {"dtype": "video", "shape": [8, 8, 3]}}},
+            "a feature is '../../secret'",
+        ),
     ],
 )
 def test_what_info_says_is_checked_by_its_reader(victim, change, words):

@@ -1,4 +1,6 @@
-"""Episodes that each have a text of their own: what a dataset makes of them, and everything that reads it."""
+"""Episodes that each have a text of their own: what a dataset makes of them, and everything that
+reads it.
+"""
 
 import json
 from dataclasses import replace
@@ -23,7 +25,9 @@ TEXTS = [RED, BLUE, RED]
 
 @pytest.fixture
 def told(episodes: list[Episode]) -> list[Episode]:
-    return [replace(episode, instruction=text) for episode, text in zip(episodes, TEXTS, strict=True)]
+    return [
+        replace(episode, instruction=text) for episode, text in zip(episodes, TEXTS, strict=True)
+    ]
 
 
 @pytest.fixture
@@ -40,8 +44,15 @@ def test_each_text_is_one_task_and_every_frame_has_its_own(root, spec):
     table = pq.read_table(root / layout.TASKS)
     assert table.to_pydict() == {"task_index": [0, 1], "task": [RED, BLUE]}
     assert json.loads((root / layout.INFO).read_text())["total_tasks"] == 2
-    assert Dataset.open(root).columns(["task_index"])["task_index"].tolist() == [0] * 7 + [1] + [0] * 12
-    rows = pq.read_table(next(root.glob(layout.EPISODES_FILES)), columns=["tasks"]).column("tasks").to_pylist()
+    assert (
+        Dataset.open(root).columns(["task_index"])["task_index"].tolist()
+        == [0] * 7 + [1] + [0] * 12
+    )
+    rows = (
+        pq.read_table(next(root.glob(layout.EPISODES_FILES)), columns=["tasks"])
+        .column("tasks")
+        .to_pylist()
+    )
     assert rows == [[text] for text in TEXTS]
     assert texts(root) == TEXTS
     assert Dataset.open(root).spec.instruction == spec.instruction

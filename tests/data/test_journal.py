@@ -27,7 +27,11 @@ HERE = Path(__file__).parent
 
 
 def assert_same(left: Episode, right: Episode) -> None:
-    assert (left.seed, left.success, left.success_at_end) == (right.seed, right.success, right.success_at_end)
+    assert (left.seed, left.success, left.success_at_end) == (
+        right.seed,
+        right.success,
+        right.success_at_end,
+    )
     assert list(left.columns) == list(right.columns)
     for key, values in right.columns.items():
         mine = left.columns[key]
@@ -35,7 +39,9 @@ def assert_same(left: Episode, right: Episode) -> None:
         assert mine.tobytes() == values.tobytes()  # bits: a minus zero is one
 
 
-def test_an_episode_comes_back_with_its_header_and_gives_the_same_bytes_again(tmp_path, episodes, spec):
+def test_an_episode_comes_back_with_its_header_and_gives_the_same_bytes_again(
+    tmp_path, episodes, spec
+):
     for count, episode in enumerate(episodes, start=1):
         path = journal.Journal(tmp_path / "new" / "folder", spec, FINGERPRINT).write(episode)
         assert_same(journal.read_journal(path)[1], episode)
@@ -53,7 +59,9 @@ def path(tmp_path: Path, make_episode: MakeEpisode, spec: s.EnvironmentSpec) -> 
 @pytest.fixture
 def filmed(tmp_path: Path, make_episode: MakeEpisode, spec: s.EnvironmentSpec) -> Path:
     spec = with_cameras(spec, "front", "wrist")
-    return journal.Journal(tmp_path / "filmed", spec, FINGERPRINT).write(numbered_episodes(make_episode, spec)[0])
+    return journal.Journal(tmp_path / "filmed", spec, FINGERPRINT).write(
+        numbered_episodes(make_episode, spec)[0]
+    )
 
 
 def test_pictures_come_back_bit_for_bit(filmed, make_episode, spec):
@@ -72,7 +80,9 @@ def test_a_file_cut_short_is_refused_by_name(path):
 def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
     """Topic -> log times and decoded messages."""
     found: dict[str, list[tuple[int, Any]]] = {}
-    reader = make_reader(io.BytesIO(path.read_bytes()), validate_crcs=True, decoder_factories=[DecoderFactory()])
+    reader = make_reader(
+        io.BytesIO(path.read_bytes()), validate_crcs=True, decoder_factories=[DecoderFactory()]
+    )
     for schema, channel, message in reader.iter_messages():
         decoder = DecoderFactory().decoder_for(channel.message_encoding, schema) or json.loads
         found.setdefault(channel.topic, []).append((message.log_time, decoder(message.data)))
@@ -110,7 +120,9 @@ for seed in range(100_000):
 
 def test_a_killed_recorder_loses_no_finished_episode(tmp_path):
     command = [sys.executable, "-c", _RECORDER, str(tmp_path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[1]) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[1]
+    ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "0\n"
         with pytest.raises(subprocess.TimeoutExpired):

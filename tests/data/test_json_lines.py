@@ -14,9 +14,14 @@ from manip_il.errors import ManipError
 def test_records_come_back_in_order(tmp_path):
     path = tmp_path / "m" / "metrics.jsonl"
     assert read_lines(path) == []
-    append_line(path, {"round": 0, "loss": np.float32(0.5), "path": Path("x"), "rates": np.array([1, 2])})
+    append_line(
+        path, {"round": 0, "loss": np.float32(0.5), "path": Path("x"), "rates": np.array([1, 2])}
+    )
     append_line(path, {"round": 1})
-    assert read_lines(path) == [{"round": 0, "loss": 0.5, "path": "x", "rates": [1, 2]}, {"round": 1}]
+    assert read_lines(path) == [
+        {"round": 0, "loss": 0.5, "path": "x", "rates": [1, 2]},
+        {"round": 1},
+    ]
 
 
 @given(cut=st.integers(min_value=0))

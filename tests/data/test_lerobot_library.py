@@ -1,4 +1,6 @@
-"""LeRobot's unmodified library judges what we write, with cameras and without: its writer, its reader and its tools."""
+"""LeRobot's unmodified library judges what we write, with cameras and without: its writer, its
+reader and its tools.
+"""
 
 import json
 import sys
@@ -49,7 +51,9 @@ def ours(tmp_path_factory, spec, episodes) -> Path:
 def films(tmp_path_factory, two, filmed) -> tuple[Path, Path]:
     """Ours and theirs with two cameras."""
     folder = tmp_path_factory.mktemp("films")
-    return write(filmed, folder / "ours", two, video=AV1), write_by_lerobot(filmed, folder / "theirs", two)
+    return write(filmed, folder / "ours", two, video=AV1), write_by_lerobot(
+        filmed, folder / "theirs", two
+    )
 
 
 @pytest.fixture(params=["state", "cameras"])
@@ -60,7 +64,11 @@ def pair(request, ours, theirs, films) -> tuple[Path, Path]:
 def write_by_lerobot(episodes: list[Episode], root: Path, spec: s.EnvironmentSpec) -> Path:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    options: dict[str, Any] = {"features": s.features(spec), "robot_type": spec.robot, "use_videos": bool(spec.cameras)}
+    options: dict[str, Any] = {
+        "features": s.features(spec),
+        "robot_type": spec.robot,
+        "use_videos": bool(spec.cameras),
+    }
     dataset = LeRobotDataset.create(REPO, fps=spec.fps, root=root, **options)
     for episode in episodes:
         add_episode(dataset, episode, spec)
@@ -83,19 +91,24 @@ def load(root: Path, **options: Any) -> Any:
 
 
 def assert_loads(root: Path, episodes: list[Episode]) -> None:
-    """LeRobot's reader gives every frame of these episodes, pictures by the number that they show."""
+    """LeRobot's reader gives every frame of these episodes, pictures by the number that they
+    show.
+    """
     import torch
 
     dataset = load(root)
     assert dataset.num_episodes == len(episodes)
-    frames = [(number, t, episode) for number, episode in enumerate(episodes) for t in range(len(episode))]
+    frames = [
+        (number, t, episode) for number, episode in enumerate(episodes) for t in range(len(episode))
+    ]
     for index, (item, (number, t, episode)) in enumerate(zip(dataset, frames, strict=True)):
         for key, values in episode.columns.items():
             if key.startswith(s.IMAGES):
                 seen = item[key].permute(1, 2, 0).numpy() * 255
                 assert numbers_of(seen[None]) == numbers_of(values[t : t + 1])
                 continue
-            if key == s.SIM_STATE:  # LeRobot makes float32 of a float64 vector; `read_table` does not
+            # LeRobot makes float32 of a float64 vector; `read_table` does not
+            if key == s.SIM_STATE:
                 values = values.astype(np.float32)
             assert item[key].dtype == torch.from_numpy(values).dtype, key
             np.testing.assert_array_equal(item[key].numpy(), values[t])
@@ -104,7 +117,9 @@ def assert_loads(root: Path, episodes: list[Episode]) -> None:
 
 
 def test_files_and_info_equal_those_of_lerobots_writer(pair):
-    left, right = ({str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()} for root in pair)
+    left, right = (
+        {str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()} for root in pair
+    )
     assert left == right | {layout.OURS}
     left, right = (json.loads((root / layout.INFO).read_text()) for root in pair)
     assert list(left) == list(right)
@@ -118,7 +133,9 @@ def test_parquet_schemas_equal_those_of_lerobots_writer(pair, name):
     assert [column for column in left.names if column not in right.names] == ours
     assert pa.schema([field for field in left if field.name not in ours]).equals(right)
     if name == DATA:
-        ours, theirs = (json.loads(one.metadata[b"huggingface"])["info"]["features"] for one in (left, right))
+        ours, theirs = (
+            json.loads(one.metadata[b"huggingface"])["info"]["features"] for one in (left, right)
+        )
         assert ours == theirs
 
 
@@ -138,7 +155,9 @@ def test_episodes_and_statistics_equal_those_of_lerobots_writer_to_their_precisi
         assert list(left[key]) == list(table)
         for name in ("min", "max", "mean", "std", "count"):
             if not key.startswith(s.IMAGES):  # LeRobot looks at some of the pixels
-                np.testing.assert_allclose(left[key][name], table[name], rtol=1e-4, atol=1e-3, err_msg=f"{key} {name}")
+                np.testing.assert_allclose(
+                    left[key][name], table[name], rtol=1e-4, atol=1e-3, err_msg=f"{key} {name}"
+                )
 
 
 @pytest.mark.parametrize("backend", ["pyav", "torchcodec"])
@@ -148,7 +167,9 @@ def test_lerobot_decodes_the_right_pictures(tmp_path, make_episode, two, backend
     root = write(episodes, tmp_path / "film", two, size=file_size)
     assert (len(list(root.rglob("*.mp4"))) > 2) == (file_size < 1)
     step = 1 / two.fps
-    dataset = load(root, video_backend=backend, delta_timestamps={key: [-step, 0] for key in two.image_keys})
+    dataset = load(
+        root, video_backend=backend, delta_timestamps={key: [-step, 0] for key in two.image_keys}
+    )
     frames = [(episode, t) for episode in episodes for t in range(len(episode))]
     for item, (episode, t) in zip(dataset, frames, strict=True):
         for key in two.image_keys:
@@ -181,7 +202,10 @@ def edit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def assert_holds(root: Path, episodes: list[Episode]) -> None:
-    """The doctor finds it whole; for LeRobot's reader and for ours, numbers are equal and pictures the right ones."""
+    """The doctor finds it whole.
+
+    For LeRobot's reader and for ours, numbers are equal and pictures the right ones.
+    """
     assert_comes_back(root, episodes)
     assert all(count_frames(path) == rows for path, rows in video_rows(root).items())
     assert not has_errors(examine_folder(root))
@@ -198,7 +222,10 @@ def test_episodes_deleted_by_lerobots_command(tmp_path, recorded, edit, seen):
     assert_holds(kept, [episodes[0], *episodes[3:]])
     s.check_same_spec("before", seen, "after", Dataset.open(kept).spec)  # LeRobot drops our file
     assert Dataset.open(kept).spec.keypoints == seen.keypoints
-    assert (Dataset.open(kept).spec.instruction, Dataset.open(kept).count_successes()) == (seen.instruction, 3)
+    assert (Dataset.open(kept).spec.instruction, Dataset.open(kept).count_successes()) == (
+        seen.instruction,
+        3,
+    )
     assert dataset_tools.recompute_stats(load(kept)).meta.stats is not None
 
 
@@ -210,7 +237,12 @@ def test_a_dataset_split_and_merged_again_by_lerobots_command(tmp_path, recorded
     parts = [tmp_path / "split" / name for name in ("train", "rest")]
     assert_holds(parts[0], episodes[:3])
     assert_holds(parts[1], episodes[3:])
-    words = ("--operation.repo_ids", "['a/train', 'a/rest']", "--operation.roots", str([str(part) for part in parts]))
+    words = (
+        "--operation.repo_ids",
+        "['a/train', 'a/rest']",
+        "--operation.roots",
+        str([str(part) for part in parts]),
+    )
     new = ("--new_repo_id", "a/all", "--new_root", str(tmp_path / "all"))
     edit(*new, "--operation.type", "merge", *words)
     assert_holds(tmp_path / "all", episodes)

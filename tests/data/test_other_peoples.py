@@ -1,4 +1,6 @@
-"""Datasets as other people have them: each is opened, has no errors, and is trained on from its pictures."""
+"""Datasets as other people have them: each is opened, has no errors, and is trained on from its
+pictures.
+"""
 
 import json
 import shutil
@@ -68,8 +70,16 @@ def check(root: Path, folder: Path) -> str:
     assert sum(map(len, map(dataset.rows_of, range(dataset.info.episodes)))) == len(dataset)
     assert len(dataset.columns()["action"]) == len(dataset) == dataset.info.frames
     assert [str(one) for one in examine_folder(root) if one.place != layout.STATS] == []
-    policy = [f"--policy.{name}={value}" for name, value in (ACT | {"chunk_size": 4, "n_action_steps": 2}).items()]
-    words = [*policy, "--policy.pretrained_backbone_weights=null", "--observation=images", "--batch_size=4"]
+    policy = [
+        f"--policy.{name}={value}"
+        for name, value in (ACT | {"chunk_size": 4, "n_action_steps": 2}).items()
+    ]
+    words = [
+        *policy,
+        "--policy.pretrained_backbone_weights=null",
+        "--observation=images",
+        "--batch_size=4",
+    ]
     told = ["train", f"--dataset.root={root}", *words, "--steps=2", f"--output_dir={folder}"]
     assert main(told) == 0
     assert (folder / "checkpoints/last/pretrained_model/model.safetensors").is_file()
@@ -92,7 +102,9 @@ def root(recorded: Path, tmp_path: Path) -> Path:
 
 
 def names_of_joints(names: Any) -> Callable[[Path], None]:
-    return lambda root: edit_json(root / layout.INFO, lambda info: info["features"]["action"].update(names=names))
+    return lambda root: edit_json(
+        root / layout.INFO, lambda info: info["features"]["action"].update(names=names)
+    )
 
 
 def tasks_without_a_named_index(root: Path) -> None:
@@ -108,12 +120,21 @@ def language(root: Path) -> None:
     table = pq.read_table(root / DATA)
     said = {"role": "user", "content": "fold it", "style": "plan", "timestamp": 0.0}
     fields = list(theirs.language_persistent_row_arrow_type())
-    columns = [pa.array([said.get(one.name)] * len(table), one.type) for one in fields if one.name != "tool_calls"]
-    rows = pa.StructArray.from_arrays([*columns, pa.nulls(len(table), fields[-1].type)], fields=fields)
+    columns = [
+        pa.array([said.get(one.name)] * len(table), one.type)
+        for one in fields
+        if one.name != "tool_calls"
+    ]
+    rows = pa.StructArray.from_arrays(
+        [*columns, pa.nulls(len(table), fields[-1].type)], fields=fields
+    )
     column = pa.ListArray.from_arrays(np.arange(len(table) + 1, dtype=np.int32), rows)
     pq.write_table(table.append_column(theirs.LANGUAGE_PERSISTENT, column), root / DATA)
     feature = {"dtype": "language", "shape": [1], "names": None}
-    edit_json(root / layout.INFO, lambda info: info["features"].update({theirs.LANGUAGE_PERSISTENT: feature}))
+    edit_json(
+        root / layout.INFO,
+        lambda info: info["features"].update({theirs.LANGUAGE_PERSISTENT: feature}),
+    )
 
 
 @pytest.mark.parametrize(
@@ -136,7 +157,10 @@ def test_empty_tasks_and_tasks_of_many_lines(tmp_path):
 
 
 def test_a_rate_that_is_no_whole_number(root, tmp_path):
-    rate, columns = Fraction(2997, 100), ("timestamp", f"videos/{TOP}/from_timestamp", f"videos/{TOP}/to_timestamp")
+    rate, columns = (
+        Fraction(2997, 100),
+        ("timestamp", f"videos/{TOP}/from_timestamp", f"videos/{TOP}/to_timestamp"),
+    )
     [video] = root.glob("videos/**/*.mp4")
     pictures = Dataset.open(root).camera(TOP).rows(np.arange(39))
     with av.open(video, "w") as container:
@@ -147,14 +171,23 @@ def test_a_rate_that_is_no_whole_number(root, tmp_path):
         container.mux(stream.encode(None))
 
     def slow_down(rows: dict[str, list[Any]]) -> None:
-        rows.update({name: [float(30 / rate) * one for one in rows[name]] for name in columns if name in rows})
+        rows.update(
+            {
+                name: [float(30 / rate) * one for one in rows[name]]
+                for name in columns
+                if name in rows
+            }
+        )
 
     edit_table(root / DATA, slow_down)
     edit_table(root / EPISODES, slow_down)
     edit_json(root / layout.INFO, lambda info: info.update(fps=29.97))
     edit_json(root / layout.STATS, lambda stats: stats.pop("timestamp"))
     assert Dataset.open(root).fps == 29.97
-    assert np.abs(Dataset.open(root).camera(TOP).rows(np.arange(39)).astype(int) - pictures).mean() < 40
+    assert (
+        np.abs(Dataset.open(root).camera(TOP).rows(np.arange(39)).astype(int) - pictures).mean()
+        < 40
+    )
     check(root, tmp_path / "run")
 
 
@@ -162,7 +195,9 @@ def test_pictures_of_two_sizes_and_kinds_one_not_called_a_camera(tmp_path):
     more = {SIDE: {"dtype": "image", "shape": (24, 24, 3), "names": NAMES}}
     root = record(tmp_path / "sizes", ["fold"] * 3, **more)
     check(root, tmp_path / "run")
-    config = json.loads((tmp_path / "run/checkpoints/last/pretrained_model/config.json").read_text())
+    config = json.loads(
+        (tmp_path / "run/checkpoints/last/pretrained_model/config.json").read_text()
+    )
     assert {TOP, SIDE} < set(config["input_features"])
 
 
@@ -170,24 +205,37 @@ def test_depth_is_left_out(tmp_path):
     depth = {"dtype": "video", "shape": (*SIZE, 1), "names": NAMES, "info": {"is_depth_map": True}}
     root = record(tmp_path / "depth", ["fold"] * 3, **{DEPTH: depth})
     check(root, tmp_path / "run")
-    config = json.loads((tmp_path / "run/checkpoints/last/pretrained_model/config.json").read_text())
+    config = json.loads(
+        (tmp_path / "run/checkpoints/last/pretrained_model/config.json").read_text()
+    )
     assert set(config["input_features"]) == {"observation.state", TOP}
 
 
-@pytest.mark.parametrize("settings", [{"type": "mlp"}, ACT, DIFFUSION], ids=lambda settings: settings["type"])
+@pytest.mark.parametrize(
+    "settings", [{"type": "mlp"}, ACT, DIFFUSION], ids=lambda settings: settings["type"]
+)
 def test_joints_alone_of_any_robot_train_a_policy_that_lerobot_loads(tmp_path, settings, capsys):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     names = {"dtype": "float32", "shape": (3,), "names": MOTORS}
     columns = {"observation.state": names, "action": names}
-    dataset: Any = LeRobotDataset.create("a/b", 30, columns, root=tmp_path / "joints", robot_type="my arm/v2.yaml")
+    dataset: Any = LeRobotDataset.create(
+        "a/b", 30, columns, root=tmp_path / "joints", robot_type="my arm/v2.yaml"
+    )
     for state in np.random.default_rng(0).normal(size=(3, 12, 3)).astype(np.float32):
         for row in state:
             dataset.add_frame({"observation.state": row, "action": 0.9 * row, "task": "fold"})
         dataset.save_episode()
     dataset.finalize()
-    policy = [f"--policy.{name}={json.dumps(value).strip(chr(34))}" for name, value in settings.items()]
-    words = [f"--dataset.root={tmp_path / 'joints'}", "--steps=2", "--batch_size=4", f"--output_dir={tmp_path / 'run'}"]
+    policy = [
+        f"--policy.{name}={json.dumps(value).strip(chr(34))}" for name, value in settings.items()
+    ]
+    words = [
+        f"--dataset.root={tmp_path / 'joints'}",
+        "--steps=2",
+        "--batch_size=4",
+        f"--output_dir={tmp_path / 'run'}",
+    ]
     assert main(["train", *policy, *words]) == 0
     assert Dataset.open(tmp_path / "joints").info.robot == "my arm/v2.yaml"
     folder = tmp_path / "run/checkpoints/last/pretrained_model"
@@ -208,10 +256,13 @@ def test_joints_alone_of_any_robot_train_a_policy_that_lerobot_loads(tmp_path, s
 
 
 def test_an_mlp_reads_what_is_there_beside_pictures(root, tmp_path):
-    assert main(["train", f"--dataset.root={root}", "--steps=2", f"--output_dir={tmp_path / 'run'}"]) == 0
-    assert LearnedPolicy.load(tmp_path / "run/checkpoints/last/pretrained_model").checkpoint.numbers == {
-        "observation.state": 3
-    }
+    assert (
+        main(["train", f"--dataset.root={root}", "--steps=2", f"--output_dir={tmp_path / 'run'}"])
+        == 0
+    )
+    assert LearnedPolicy.load(
+        tmp_path / "run/checkpoints/last/pretrained_model"
+    ).checkpoint.numbers == {"observation.state": 3}
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +270,10 @@ def annotated(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two datasets with depth and LeRobot's columns of language."""
     depth = {"dtype": "video", "shape": (*SIZE, 1), "names": NAMES, "info": {"is_depth_map": True}}
     folder = tmp_path_factory.mktemp("annotated")
-    roots = [record(folder / name, tasks, **{DEPTH: depth}) for name, tasks in (("a", ["fold"] * 3), ("b", ["un"] * 2))]
+    roots = [
+        record(folder / name, tasks, **{DEPTH: depth})
+        for name, tasks in (("a", ["fold"] * 3), ("b", ["un"] * 2))
+    ]
     for root in roots:
         language(root)
     return roots
@@ -231,8 +285,14 @@ def items(root: Path) -> list[dict[str, Any]]:
 
     numbers = {"index", "episode_index", "task_index"}
     dataset: Any = LeRobotDataset("a/b", root=root)
-    found = [{key: value for key, value in one.items() if key not in numbers} for one in map(dict, dataset)]
-    return [{key: getattr(value, "tolist", lambda value=value: value)() for key, value in one.items()} for one in found]
+    found = [
+        {key: value for key, value in one.items() if key not in numbers}
+        for one in map(dict, dataset)
+    ]
+    return [
+        {key: getattr(value, "tolist", lambda value=value: value)() for key, value in one.items()}
+        for one in found
+    ]
 
 
 def test_merged_datasets_of_others_are_for_lerobot_those_of_their_frames(annotated, tmp_path):
@@ -245,24 +305,51 @@ def test_merged_datasets_of_others_are_for_lerobot_those_of_their_frames(annotat
 
 
 def test_chosen_episodes_are_taken_with_their_part_of_the_films(annotated, tmp_path):
-    words = ["data", "merge", *map(str, annotated), "--dataset.episodes=[1,3:5]", f"--output={tmp_path / 'part'}"]
+    words = [
+        "data",
+        "merge",
+        *map(str, annotated),
+        "--dataset.episodes=[1,3:5]",
+        f"--output={tmp_path / 'part'}",
+    ]
     assert main(words) == 0
     first, second = map(items, annotated)
     assert items(tmp_path / "part") == first[12:25] + second
     assert examine_folder(tmp_path / "part") == []
-    assert main(["data", "merge", str(annotated[0]), "--dataset.episodes=2:9", f"--output={tmp_path / 'no'}"]) == 2
+    assert (
+        main(
+            [
+                "data",
+                "merge",
+                str(annotated[0]),
+                "--dataset.episodes=2:9",
+                f"--output={tmp_path / 'no'}",
+            ]
+        )
+        == 2
+    )
 
 
 def test_a_camera_is_renamed_where_it_has_another_name(root, recorded, tmp_path):
     names = json.dumps({TOP: FRONT})
-    assert main(["data", "merge", str(root), f"--rename_map={names}", f"--output={tmp_path / 'front'}"]) == 0
+    assert (
+        main(
+            ["data", "merge", str(root), f"--rename_map={names}", f"--output={tmp_path / 'front'}"]
+        )
+        == 0
+    )
     both = [str(recorded), str(tmp_path / "front")]
     assert main(["data", "merge", *both, f"--output={tmp_path / 'no'}"]) == 1
-    assert main(["data", "merge", *both, f"--rename_map={names}", f"--output={tmp_path / 'both'}"]) == 0
+    assert (
+        main(["data", "merge", *both, f"--rename_map={names}", f"--output={tmp_path / 'both'}"])
+        == 0
+    )
     merged, before = Dataset.open(tmp_path / "both"), Dataset.open(recorded)
     assert merged.cameras == [FRONT]
     pictures = before.frames(TOP, np.arange(len(before)))
-    np.testing.assert_array_equal(merged.frames(FRONT, np.arange(len(merged))), np.concatenate([pictures] * 2))
+    np.testing.assert_array_equal(
+        merged.frames(FRONT, np.arange(len(merged))), np.concatenate([pictures] * 2)
+    )
     assert examine_folder(tmp_path / "both") == []
 
 
@@ -275,8 +362,14 @@ def test_a_camera_is_renamed_where_it_has_another_name(root, recorded, tmp_path)
             lambda info: info["features"][TOP]["info"].update({"video.codec": "h264"}),
             f"film {TOP}: video.codec differs",
         ),
-        (lambda info: info["features"][TOP].update(shape=[24, 32, 3]), f"column {TOP} differs: .*24, 32, 3"),
-        (lambda info: info.update(robot_type="koch"), "robot_type differs: .*/plain has koch, .*/plain has none"),
+        (
+            lambda info: info["features"][TOP].update(shape=[24, 32, 3]),
+            f"column {TOP} differs: .*24, 32, 3",
+        ),
+        (
+            lambda info: info.update(robot_type="koch"),
+            "robot_type differs: .*/plain has koch, .*/plain has none",
+        ),
     ],
 )
 def test_what_a_merge_cannot_keep_is_refused_by_name(root, recorded, tmp_path, change, what):

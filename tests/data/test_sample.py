@@ -48,14 +48,19 @@ def test_lerobots_loader_reads_it():
 @pytest.mark.slow
 def test_it_can_be_recorded_again(tmp_path):
     again = tmp_path / "sample"
-    assert main(["record", "--dataset.num_episodes=10", f"--dataset.root={again}", "--workers=1"]) == 0
-    assert np.array_equal(Dataset.open(SAMPLE).columns()["seed"], Dataset.open(again).columns()["seed"])
+    assert (
+        main(["record", "--dataset.num_episodes=10", f"--dataset.root={again}", "--workers=1"]) == 0
+    )
+    assert np.array_equal(
+        Dataset.open(SAMPLE).columns()["seed"], Dataset.open(again).columns()["seed"]
+    )
     differing = {
         key
         for key, ours in Dataset.open(SAMPLE).fingerprint.items()
         if Dataset.open(again).fingerprint.get(key) != ours
     }
-    assert "model_sha256" not in differing or differing & {"mujoco", "processor"}  # else the same model
+    # else the same model
+    assert "model_sha256" not in differing or differing & {"mujoco", "processor"}
     if not differing:
         assert digests(SAMPLE) == digests(again)
     elif differing == {"processor"}:
@@ -65,14 +70,21 @@ def test_it_can_be_recorded_again(tmp_path):
 
 @pytest.mark.slow
 def test_another_processor_records_the_same_within_the_tolerance(tmp_path):
-    """BLAS and numpy are told that the processor has no vector extensions to speak of: other last bits."""
+    """BLAS and numpy are told that the processor has no vector extensions to speak of: other
+    last bits.
+    """
     again, other = tmp_path / "again", tmp_path / "other"
     words = ["record", "--dataset.num_episodes=3", "--dataset.repo_id=local/sample", "--workers=1"]
     assert main([*words, f"--dataset.root={again}"]) == 0
-    plain = {"OPENBLAS_CORETYPE": PLAIN_KERNELS[platform.machine()], "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA"}
+    plain = {
+        "OPENBLAS_CORETYPE": PLAIN_KERNELS[platform.machine()],
+        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA",
+    }
     command = [sys.executable, "-m", "manip_il.cli.main", *words, f"--dataset.root={other}"]
     subprocess.run(command, check=True, cwd=ROOT, env=os.environ | plain)
-    assert Dataset.open(again).fingerprint["processor"] != Dataset.open(other).fingerprint["processor"]
+    assert (
+        Dataset.open(again).fingerprint["processor"] != Dataset.open(other).fingerprint["processor"]
+    )
     assert digests(again) != digests(other)  # else this shows nothing
     assert_same_within_tolerance(again, other)
 
@@ -85,6 +97,8 @@ def assert_same_within_tolerance(left: Path, right: Path) -> None:
         if key == "sim_state":
             continue  # holds the solver's warm start, which is no quantity of the world
         if column.dtype.kind == "f":
-            np.testing.assert_allclose(column, theirs[key], rtol=0, atol=EPISODE_TOLERANCE, err_msg=key)
+            np.testing.assert_allclose(
+                column, theirs[key], rtol=0, atol=EPISODE_TOLERANCE, err_msg=key
+            )
         else:
             assert np.array_equal(column, theirs[key]), key

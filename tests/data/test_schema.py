@@ -23,7 +23,9 @@ def test_a_spec_survives_json(spec):
 
 
 def test_one_spec_agrees_with_itself_on_another_task(spec):
-    s.check_same_spec("dataset", spec, "policy", dataclasses.replace(spec, task="reach", instruction="Reach."))
+    s.check_same_spec(
+        "dataset", spec, "policy", dataclasses.replace(spec, task="reach", instruction="Reach.")
+    )
 
 
 @pytest.mark.parametrize(
@@ -62,12 +64,17 @@ def test_a_fingerprint_names_versions_and_hashes_what_it_is_given():
 
 
 def test_configs_have_one_canonical_text():
-    assert canonical_json({"gains": (1.0, 2.0), "config": Config()}) == '{"config":{"rate":0.5},"gains":[1.0,2.0]}'
+    assert (
+        canonical_json({"gains": (1.0, 2.0), "config": Config()})
+        == '{"config":{"rate":0.5},"gains":[1.0,2.0]}'
+    )
     with pytest.raises(TypeError, match="dataclass"):
         canonical_json({"x": object()})
 
 
-def test_two_makers_processors_with_the_same_extensions_have_two_fingerprints(tmp_path, monkeypatch):
+def test_two_makers_processors_with_the_same_extensions_have_two_fingerprints(
+    tmp_path, monkeypatch
+):
     found = []
     for maker, family, model in (("GenuineIntel", 6, 143), ("AuthenticAMD", 25, 17)):
         said = f"processor : 0\nvendor_id : {maker}\ncpu family : {family}\nmodel : {model}\n"

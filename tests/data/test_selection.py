@@ -1,4 +1,6 @@
-"""One rollout, several episodes of a dataset: parts, budgets, and the same bytes when it is built again."""
+"""One rollout, several episodes of a dataset: parts, budgets, and the same bytes when it is
+built again.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -53,9 +55,15 @@ def test_parts_are_the_rollout_cut_behind_every_done(rollout):
     episode = rollout(7)
     pieces = parts(episode)
     assert [len(piece) for piece in pieces] == [4, 3, 3]
-    assert [(piece.success, piece.success_at_end) for piece in pieces] == [(False, False), (False, False), (True, True)]
+    assert [(piece.success, piece.success_at_end) for piece in pieces] == [
+        (False, False),
+        (False, False),
+        (True, True),
+    ]
     for key, column in episode.columns.items():
-        np.testing.assert_array_equal(np.concatenate([piece.columns[key] for piece in pieces]), column)
+        np.testing.assert_array_equal(
+            np.concatenate([piece.columns[key] for piece in pieces]), column
+        )
 
 
 @pytest.mark.parametrize(
@@ -83,7 +91,9 @@ def test_a_dataset_has_what_the_recording_says_and_is_built_again_to_the_byte(
 
 def test_rollouts_without_a_label_make_no_dataset(make_episode, spec, tmp_path):
     episode = make_episode(7)
-    unasked = replace(episode, columns=episode.columns | {s.LABEL_VALID: np.zeros((len(episode), 1), np.int64)})
+    unasked = replace(
+        episode, columns=episode.columns | {s.LABEL_VALID: np.zeros((len(episode), 1), np.int64)}
+    )
     with pytest.raises(NothingToLearnError, match="the expert was never queried"):
         recorded([unasked], spec, tmp_path, Recording(only_labelled=True))
     assert not (tmp_path / "d").exists()

@@ -28,7 +28,9 @@ def seen(episodes) -> list[Episode]:
     rng = np.random.default_rng(0)
 
     def pictures(episode: Episode) -> dict[str, np.ndarray]:
-        return {key: rng.integers(0, 256, (len(episode), 32, 48, 3), np.uint8) for key in (FRONT, SIDE)}
+        return {
+            key: rng.integers(0, 256, (len(episode), 32, 48, 3), np.uint8) for key in (FRONT, SIDE)
+        }
 
     return [replace(episode, columns=episode.columns | pictures(episode)) for episode in episodes]
 
@@ -45,7 +47,9 @@ def test_pictures_come_back_bit_for_bit(root, seen, pictured):
     assert not (root / "videos").exists()
     for written, read in zip(seen, read_episodes(root), strict=True):
         for key, column in read.columns.items():
-            np.testing.assert_array_equal(column.reshape(written.columns[key].shape), written.columns[key])
+            np.testing.assert_array_equal(
+                column.reshape(written.columns[key].shape), written.columns[key]
+            )
     np.testing.assert_array_equal(episode_frames(root, SIDE, 2), seen[2].columns[SIDE])
 
 
@@ -55,4 +59,6 @@ def test_merged_with_films_they_become_films(root, seen, pictured, tmp_path):
         merge_datasets(sources, tmp_path / name)
         assert examine_folder(tmp_path / name) == []
         frames = Dataset.open(films).frames(FRONT, np.arange(20))
-        np.testing.assert_array_equal(Dataset.open(tmp_path / name).frames(FRONT, np.arange(40)), [*frames, *frames])
+        np.testing.assert_array_equal(
+            Dataset.open(tmp_path / name).frames(FRONT, np.arange(40)), [*frames, *frames]
+        )

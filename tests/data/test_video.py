@@ -39,7 +39,9 @@ FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory, filmed: list[Episode], two: s.EnvironmentSpec) -> Path:
+def root(
+    tmp_path_factory: pytest.TempPathFactory, filmed: list[Episode], two: s.EnvironmentSpec
+) -> Path:
     return write(filmed, tmp_path_factory.mktemp("filmed") / "lift", two)
 
 
@@ -66,7 +68,11 @@ def test_timestamps_are_exact(root, two):
     path = next(iter(video_rows(root)))
     with closing(av.open(str(path))) as container:
         stream = container.streams.video[0]
-        times = [packet.pts * packet.time_base for packet in container.demux(stream) if packet.pts is not None]
+        times = [
+            packet.pts * packet.time_base
+            for packet in container.demux(stream)
+            if packet.pts is not None
+        ]
         assert stream.average_rate == two.fps  # by which torchcodec finds a frame
     assert times == [Fraction(number, two.fps) for number in range(21)]
 
@@ -75,7 +81,8 @@ def test_timestamps_are_exact(root, two):
 def test_a_rate_that_is_not_whole_is_that_of_rows_videos_and_policies(filmed, two, tmp_path, fps):
     root = write(filmed, tmp_path / "lift", dataclasses.replace(two, fps=fps))
     assert json.loads((root / layout.INFO).read_text())["fps"] == fps
-    theirs: Any = LeRobotDataset("local/lift", root=root)  # refuses a frame that is off by a tenth of a millisecond
+    # refuses a frame that is off by a tenth of a millisecond
+    theirs: Any = LeRobotDataset("local/lift", root=root)
     pictures = np.stack([255 * theirs[row][FRONT].numpy().transpose(1, 2, 0) for row in range(21)])
     assert numbers_of(pictures) == list(range(21))
     assert not has_errors(examine_folder(root))
@@ -91,12 +98,19 @@ def test_the_same_episodes_give_the_same_bytes(root, tmp_path, filmed, two):
 def test_statistics_of_pictures_are_those_of_every_pixel(root, filmed):
     stats = json.loads((root / layout.STATS).read_text())[FRONT]
     assert stats["count"] == [21]
-    pixels = np.concatenate([episode.columns[FRONT] for episode in filmed]).reshape(-1, 3).astype(np.float64) / 255
+    pixels = (
+        np.concatenate([episode.columns[FRONT] for episode in filmed])
+        .reshape(-1, 3)
+        .astype(np.float64)
+        / 255
+    )
     expected = {"min": pixels.min(axis=0), "max": pixels.max(axis=0), "mean": pixels.mean(axis=0)}
     expected |= {"std": pixels.std(axis=0)}
     for name, share in layout.QUANTILES.items():
         parts = [episode.columns[FRONT].reshape(-1, 3) / 255 for episode in filmed]
-        each = [len(part) * np.quantile(part, share, axis=0, method="inverted_cdf") for part in parts]
+        each = [
+            len(part) * np.quantile(part, share, axis=0, method="inverted_cdf") for part in parts
+        ]
         expected[name] = sum(each) / len(pixels)
     for name, values in expected.items():
         assert np.shape(stats[name]) == (3, 1, 1)
@@ -105,7 +119,9 @@ def test_statistics_of_pictures_are_those_of_every_pixel(root, filmed):
 
 def test_an_encoder_makes_no_thread_a_real_time_one():
     try_encoder(VideoConfig(vcodec="libsvtav1"), (64, 64), 10)
-    assert {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")} == {os.SCHED_OTHER}
+    assert {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")} == {
+        os.SCHED_OTHER
+    }
 
 
 def test_datasets_with_cameras_become_one_with_the_same_pictures(tmp_path, root):
@@ -124,7 +140,9 @@ def test_datasets_with_cameras_become_one_with_the_same_pictures(tmp_path, root)
 
 
 @pytest.mark.parametrize("video", [True, False])
-def test_a_dataset_with_cameras_tells_of_itself_also_by_lerobots_own_description(filmed, two, tmp_path, video):
+def test_a_dataset_with_cameras_tells_of_itself_also_by_lerobots_own_description(
+    filmed, two, tmp_path, video
+):
     two = dataclasses.replace(two, video=video)
     root = write(filmed, tmp_path / "lift", two)
     assert (Dataset.open(root).cameras, Dataset.open(root).spec) == ([FRONT, WRIST], two)

@@ -1,4 +1,6 @@
-"""A process in which a page's commands and snippets run, one after the other: its memory goes back with it."""
+"""A process in which a page's commands and snippets run, one after the other: its memory goes
+back with it.
+"""
 
 import contextlib
 import gc
@@ -16,7 +18,9 @@ from ..store.servers import talk_to
 
 
 class Ours(AbstractContextManager["Ours"]):
-    """The process starts within milliseconds, as what it imports is loaded once, when it is first needed."""
+    """The process starts within milliseconds, as what it imports is loaded once, when it is
+    first needed.
+    """
 
     def __init__(self, log: Path, environment: Mapping[str, str]) -> None:
         self._log, given = log, (str(log), dict(environment))
@@ -25,10 +29,16 @@ class Ours(AbstractContextManager["Ours"]):
     def run(self, words: list[str], folder: Path, what: str) -> None:
         """Run the words behind `manip-il` in a folder; fail unless they end with exit code 0."""
         code = self._pool.submit(_run, words, folder).result()
-        assert code == 0, f"{what}\nas: manip-il {shlex.join(words)}\n{self._log.read_text(errors='replace')[-4000:]}"
+        assert code == 0, (
+            f"{what}\nas: manip-il"
+            f" {shlex.join(words)}\n{self._log.read_text(errors='replace')[-4000:]}"
+        )
 
     def execute(self, code: str, folder: Path, name: str) -> None:
-        """Execute a snippet in a folder; a task that it defines is kept there as a file, as the pages ask."""
+        """Execute a snippet in a folder.
+
+        A task that it defines is kept there as a file, as the pages ask.
+        """
         self._pool.submit(_execute, code, folder, name).result()
 
     def __exit__(self, *error: object) -> None:

@@ -102,7 +102,9 @@ def help_lines() -> list[Line]:
     texts = {name: str(load(name).__doc__).rpartition("Example: ")[2] for name in COMMANDS}
     examples = {f"{name} --help": " ".join(text.split()) for name, text in texts.items()}
     first = _help().rpartition("example: ")[2]
-    assert first in examples.values(), f"manip-il --help: {first!r} is not the example of its command"
+    assert first in examples.values(), (
+        f"manip-il --help: {first!r} is not the example of its command"
+    )
     return [Line(f"manip-il {name}", tuple(shlex.split(text))) for name, text in examples.items()]
 
 

@@ -28,7 +28,8 @@ SMALL: Sizes = {  # put into every command that has the option
     "eval.n_episodes": 2,
     "n_episodes": 1,
     "eval.films": 0,
-    "env.horizon": 60,  # a demonstration takes 40 steps; a policy that has learnt nothing takes all that it is given
+    # a demonstration takes 40 steps; a policy that has learnt nothing takes all that it is given
+    "env.horizon": 60,
     "training_seeds": 1,
     "cases": 1,
     "workers": 1,
@@ -46,8 +47,10 @@ OF_COMMAND: dict[str, Sizes] = {
     "rl gail": {"episodes": 2, "ppo.minibatches": 2, "ppo.epochs": 1, "discriminator.steps": 1},
     "rl airl": {"episodes": 2, "ppo.minibatches": 2, "ppo.epochs": 1, "discriminator.steps": 1},
     "rl ppo": {"episodes": 2, "episode_steps": 20, "ppo.minibatches": 2, "ppo.epochs": 1},
-    "data redraw": {"frames": 30, "image.height": 96, "image.width": 96},  # diffusion cuts out 84 x 84 pixels
-    "view": {"output": "seen.rrd"},  # a viewer that is served lives as long as its process, which runs all the lines
+    # diffusion cuts out 84 x 84 pixels
+    "data redraw": {"frames": 30, "image.height": 96, "image.width": 96},
+    # a viewer that is served lives as long as its process, which runs all the lines
+    "view": {"output": "seen.rrd"},
 }
 OF_POLICY: dict[str, Sizes] = {
     "mlp": {"width": 16},
@@ -72,17 +75,30 @@ def small_words(words: Sequence[str]) -> list[str]:
         return list(words)
     known = {option.name for option in options_of(load(name)) if not option.positional}
     given = option_names(own)
-    small = {option: size for option, size in SMALL.items() if option != "env.horizon" or not _is_stock(own)}
-    sizes = {option: size for option, size in (small | OF_COMMAND.get(name, {})).items() if option in known}
+    small = {
+        option: size
+        for option, size in SMALL.items()
+        if option != "env.horizon" or not _is_stock(own)
+    }
+    sizes = {
+        option: size
+        for option, size in (small | OF_COMMAND.get(name, {})).items()
+        if option in known
+    }
     sizes |= {option: size for option, size in GIVEN.items() if option in given}
     if {"policy", "policy.width"} & known:
         kind = _value("policy.type", own) or _policy_in_config(own) or "mlp"
         sizes |= {f"policy.{option}": size for option, size in OF_POLICY.get(kind, {}).items()}
     if name == "compare" and own[0].endswith(".yaml"):  # the study's own file has its sizes
-        sizes = {option: size for option, size in sizes.items() if not option.startswith(("eval.", "env."))}
+        sizes = {
+            option: size
+            for option, size in sizes.items()
+            if not option.startswith(("eval.", "env."))
+        }
     if name == "serve":  # it serves for as long as a program runs
         served = own[: own.index("--") if "--" in own else None]
-        served = [word for word in served if not word.startswith("--log=")]  # nothing drives, so nothing is logged
+        # nothing drives, so nothing is logged
+        served = [word for word in served if not word.startswith("--log=")]
         return [name, *with_sizes(served, sizes), "--", "true"]
     return [*name.split(), *with_sizes(own, sizes)]
 
@@ -103,7 +119,9 @@ def small_lerobot(words: Sequence[str]) -> list[str]:
 
 
 def with_sizes(words: Iterable[str], sizes: Mapping[str, Any]) -> list[str]:
-    """These words with other values of these options, or with the options where they are missing."""
+    """These words with other values of these options, or with the options where they are
+    missing.
+    """
     kept: list[str] = []
     rest = list(words)
     while rest:
@@ -136,7 +154,10 @@ def _policy_in_config(words: Iterable[str]) -> str:
 
 
 def shrink_study(path: Path) -> None:
-    """Leave a study two of its arms, of small sizes, in place; all of them are read in `tests/cli/test_study.py`."""
+    """Leave a study two of its arms, of small sizes, in place.
+
+    All of them are read in `tests/cli/test_study.py`.
+    """
     study = yaml.safe_load(path.read_text(encoding="utf-8"))
     of_dagger = {option.name for option in options_of(load("dagger"))}
     if any("task.type" in arm for arm in study["arms"].values()):  # of tasks that take so few steps
@@ -147,7 +168,11 @@ def shrink_study(path: Path) -> None:
         for option, size in (SMALL | GIVEN).items():
             if option in of_dagger and option in arm:
                 arm[option] = size
-    common |= {option: size for option, size in SMALL.items() if option in of_dagger and option != "workers"}
+    common |= {
+        option: size
+        for option, size in SMALL.items()
+        if option in of_dagger and option != "workers"
+    }
     policy = common.setdefault("policy", {})
     policy |= OF_POLICY.get(policy.get("type", "mlp"), {})
     if "image" in common:

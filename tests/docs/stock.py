@@ -1,4 +1,6 @@
-"""The folders that documented commands take for granted, each made once, when it is first needed, and small."""
+"""The folders that documented commands take for granted, each made once, when it is first
+needed, and small.
+"""
 
 import shutil
 from pathlib import Path
@@ -14,7 +16,9 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
     "datasets/demos.journals": "record --dataset.root=datasets/demos",
     "datasets/seen": "record --cameras=front,wrist --dataset.root=datasets/seen",
     "datasets/more": "record --dataset.root=datasets/more",
-    "datasets/session.journals": "record --robot.type=so101 --task.type=lift --dataset.root=datasets/session",
+    "datasets/session.journals": (
+        "record --robot.type=so101 --task.type=lift --dataset.root=datasets/session"
+    ),
     "datasets/carry": "record --task.type=carry --dataset.root=datasets/carry",
     "runs/irl": "irl datasets/carry --output_dir=runs/irl",
     "demos_mcap": "data to-mcap datasets/demos demos_mcap",
@@ -25,17 +29,21 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
     "runs/cloning": "dagger --method=cloning --output_dir=runs/cloning",
     "pairs.json": "reward pairs runs/dagger --output=pairs.json",
     "preferences.json": "reward answer pairs.json --sources=runs/dagger --output=preferences.json",
-    "runs/reward": "reward fit pairs.json preferences.json --sources=runs/dagger --output_dir=runs/reward",
+    "runs/reward": (
+        "reward fit pairs.json preferences.json --sources=runs/dagger --output_dir=runs/reward"
+    ),
     "runs/eval": f"{_EXPERT} --output_dir=runs/eval",
     "out/0": f"{_EXPERT} --eval.first=0 --output_dir=out/0",
     "out/1": f"{_EXPERT} --eval.first=2 --output_dir=out/1",
     "out/2": f"{_EXPERT} --eval.first=4 --output_dir=out/2",
 }
-READ_BY = {"pairs.json": "runs/dagger"}  # what a file names, and a command that is given the file reads
+# what a file names, and a command that is given the file reads
+READ_BY = {"pairs.json": "runs/dagger"}
 ARM = Path("my_arm.yaml")
 SAMPLE = "datasets/sample"  # comes with the repository
 _OUTPUTS = ("output", "output_dir", "output-dir", "video", "new_root", "log")
-_TARGETS = ("data build", "data render", "data to-mcap", "data from-mcap", "pull")  # make their second
+# make their second
+_TARGETS = ("data build", "data render", "data to-mcap", "data from-mcap", "pull")
 
 
 class Stock:
@@ -52,7 +60,9 @@ class Stock:
                 write(target, name=ARM.stem)
             if path.endswith(".xml") and not (target / path).exists():
                 (target / path).write_text(model_of())
-            name = next((name for name in (*RECIPES, SAMPLE) if f"{path}/".startswith(f"{name}/")), None)
+            name = next(
+                (name for name in (*RECIPES, SAMPLE) if f"{path}/".startswith(f"{name}/")), None
+            )
             if name is None or (target / name).exists():
                 continue
             made = self._made(name, ours)

@@ -16,7 +16,15 @@ from .stock import Stock
 from .workplace import PROGRAM, RULES, LeRobot, Workplace
 
 BUCKET = "robots"  # the one in the docs
-_DRAWS = ("--cameras=", "redraw", "--video", "data render", "manip-il eval --check", "datasets/seen", "reward ask")
+_DRAWS = (
+    "--cameras=",
+    "redraw",
+    "--video",
+    "data render",
+    "manip-il eval --check",
+    "datasets/seen",
+    "reward ask",
+)
 
 
 @pytest.fixture(scope="session")
@@ -39,9 +47,14 @@ def bucket() -> Iterator[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def lerobot(running_hub: Hub, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LeRobot]:
-    """Runs a command of LeRobot's, or a script, in a folder; the Hub of the tests is the only one that it knows."""
+    """Runs a command of LeRobot's, or a script, in a folder.
+
+    The Hub of the tests is the only one that it knows.
+    """
     home = tmp_path_factory.mktemp("home")
-    clean = {name: value for name, value in os.environ.items() if not name.startswith(("HF_", "HUGGING"))}
+    clean = {
+        name: value for name, value in os.environ.items() if not name.startswith(("HF_", "HUGGING"))
+    }
     clean |= {"HF_ENDPOINT": running_hub.url, "HF_HOME": str(home / "hf"), "HF_TOKEN": TOKEN}
     clean |= {"HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1"}
     clean |= {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "PYTHONPATH": str(ROOT)}
@@ -49,7 +62,9 @@ def lerobot(running_hub: Hub, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
         def run(words: list[str], folder: Path) -> None:
             done = warm.run(*words, folder=folder)
-            assert done.returncode == 0, f"{words} ended with {done.returncode}: {(done.stdout + done.stderr)[-4000:]}"
+            assert done.returncode == 0, (
+                f"{words} ended with {done.returncode}: {(done.stdout + done.stderr)[-4000:]}"
+            )
 
         yield run
 
@@ -63,7 +78,9 @@ def workplace(
     request: pytest.FixtureRequest,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Workplace]:
-    """A folder with the repository's configs, studies made small, and servers that answer for the Hub and S3."""
+    """A folder with the repository's configs, studies made small, and servers that answer for
+    the Hub and S3.
+    """
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     for study in (tmp_path / "configs" / "studies").glob("*.yaml"):
         shrink_study(study)
@@ -115,4 +132,7 @@ def test_every_block_of_a_page_is_of_a_kind_that_the_tests_know(page: str):
         assert block.language in LANGUAGES, block.where
         if block.language == "text":
             first_words = {line.split()[0] for line in block.text.splitlines() if line.split()}
-            assert not first_words & {PROGRAM, *RULES}, f"{block.where}: commands belong into a block of `sh`"
+            assert not first_words & {
+                PROGRAM,
+                *RULES,
+            }, f"{block.where}: commands belong into a block of `sh`"

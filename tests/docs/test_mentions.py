@@ -16,7 +16,11 @@ _INLINE_COMMAND = re.compile(r"`manip-il ([a-z]+(?: [a-z-]+)?)")
 @pytest.mark.parametrize("page", PAGES)
 def test_every_command_is_one_that_there_is(page: str):
     text = (ROOT / page).read_text(encoding="utf-8")
-    unknown = [words for words in _INLINE_COMMAND.findall(text) if not {words, words.split()[0]} & {*COMMANDS, *GROUPS}]
+    unknown = [
+        words
+        for words in _INLINE_COMMAND.findall(text)
+        if not {words, words.split()[0]} & {*COMMANDS, *GROUPS}
+    ]
     assert unknown == []
 
 
@@ -33,7 +37,10 @@ def test_every_link_leads_to_a_file_and_heading_of_the_repository(page: str):
 
 
 def test_every_page_of_the_docs_is_on_the_map():
-    on_the_map = {link.partition("#")[0] for link in _LINK.findall((ROOT / "docs/README.md").read_text("utf-8"))}
+    on_the_map = {
+        link.partition("#")[0]
+        for link in _LINK.findall((ROOT / "docs/README.md").read_text("utf-8"))
+    }
     pages = {str(path.relative_to(ROOT / "docs")) for path in ROOT.glob("docs/**/*.md")}
     assert pages - {"README.md"} <= on_the_map
 

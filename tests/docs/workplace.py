@@ -19,13 +19,17 @@ from .stock import RECIPES, Stock
 
 PROGRAM = "manip-il"
 _NAMES = {"USER": "user", "NAME": "name", "//me/": "//user/", "datasets/me/": "datasets/user/"}
-_OF_A_CONTAINER = re.compile(r"(?:(?<=^)|(?<==))/(?=(?:policy|out)\b)")  # its volumes, as folders of this place
+# its volumes, as folders of this place
+_OF_A_CONTAINER = re.compile(r"(?:(?<=^)|(?<==))/(?=(?:policy|out)\b)")
 
 LeRobot = Callable[[list[str], Path], None]
 
 
 class Workplace:
-    """Runs lines. A line that no rule covers is an error. ours: runs commands and code in the process of the page."""
+    """Runs lines.
+
+    A line that no rule covers is an error. ours: runs commands and code in the process of the page.
+    """
 
     def __init__(self, folder: Path, ours: Ours, stock: Stock, lerobot: LeRobot) -> None:
         self.folder, self.ours, self.stock, self.lerobot = folder, ours, stock, lerobot
@@ -75,10 +79,22 @@ class Workplace:
         (self.folder / named[1]).write_text(block.text, encoding="utf-8")
 
     def _make(self, line: Line) -> None:
-        """What the target would run of this program; the rest of it is machinery that CI runs itself."""
-        clean = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MAKELEVEL")}
+        """What the target would run of this program.
+
+        The rest of it is machinery that CI runs itself.
+        """
+        clean = {
+            name: value
+            for name, value in os.environ.items()
+            if name not in ("MAKEFLAGS", "MAKELEVEL")
+        }
         done = subprocess.run(
-            ["make", "--dry-run", *line.words[1:]], capture_output=True, text=True, cwd=ROOT, env=clean, check=False
+            ["make", "--dry-run", *line.words[1:]],
+            capture_output=True,
+            text=True,
+            cwd=ROOT,
+            env=clean,
+            check=False,
         )
         assert done.returncode == 0, f"{line}: {done.stderr}"
         for recipe in done.stdout.splitlines():
@@ -86,10 +102,18 @@ class Workplace:
                 self.run(Line(line.where, (PROGRAM, *shlex.split(recipe)[1:])))
 
     def _docker(self, line: Line) -> None:
-        """Building and running are CI's; what is asked of the program in the container must be words it knows."""
+        """Building and running are CI's.
+
+        What is asked of the program in the container must be words it knows.
+        """
         if line.words[1] == "build":
-            arguments = [word.partition("=")[0] for word in line.words if re.fullmatch(r"[A-Z_]+=\w+", word)]
-            assert all(f"ARG {name}=" in (ROOT / "Dockerfile").read_text(encoding="utf-8") for name in arguments)
+            arguments = [
+                word.partition("=")[0] for word in line.words if re.fullmatch(r"[A-Z_]+=\w+", word)
+            ]
+            assert all(
+                f"ARG {name}=" in (ROOT / "Dockerfile").read_text(encoding="utf-8")
+                for name in arguments
+            )
             return
         assert line.words[1] == "run", f"{line}: neither build nor run"
         _, _, asked = shlex.join(line.words).partition(f" {PROGRAM}")
@@ -106,16 +130,22 @@ class Workplace:
     def _export(self, line: Line) -> None:
         """The tests' own servers have set them."""
         names = [word.partition("=")[0] for word in line.words[1:]]
-        assert all(name in os.environ for name in names), f"{line}: no server of the tests reads these"
+        assert all(name in os.environ for name in names), (
+            f"{line}: no server of the tests reads these"
+        )
 
     def _activate(self, line: Line) -> None:
         assert line.words == (".", ".venv/bin/activate")
         assert (Path(sys.prefix) / "bin" / "activate").is_file()
 
     def _apt_get(self, line: Line) -> None:
-        """The packages are those with which CI starts from a bare Debian, and those that `make` brings."""
+        """The packages are those with which CI starts from a bare Debian, and those that `make`
+        brings.
+        """
         assert line.words[1:3] == ("install", "-y")
-        text = "".join((ROOT / ".ci" / name).read_text(encoding="utf-8") for name in ("fresh", "system"))
+        text = "".join(
+            (ROOT / ".ci" / name).read_text(encoding="utf-8") for name in ("fresh", "system")
+        )
         missing = set(line.words[3:]) - set(re.findall(r"[\w.-]+", text))
         assert not missing, f"{line}: CI does without {missing}"
 

@@ -1,4 +1,6 @@
-"""Sixteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found, and nothing else."""
+"""Sixteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found,
+and nothing else.
+"""
 
 import re
 import shutil
@@ -24,13 +26,17 @@ Rng = np.random.Generator
 Plant = Callable[[Path, Rng], str | None]  # returns a pattern of the finding's line
 
 
-def move(root: Path, change: Callable[[np.ndarray, np.ndarray], None], episodes: Any = range(COUNT)) -> None:
+def move(
+    root: Path, change: Callable[[np.ndarray, np.ndarray], None], episodes: Any = range(COUNT)
+) -> None:
     """Change state and action, (T, 5) each, of these episodes in place."""
     dataset = Dataset.open(root)
     columns = {key: values.copy() for key, values in dataset.columns([s.STATE, s.ACTION]).items()}
     for rows in map(dataset.rows_of, episodes):
         change(*(columns[key][rows[0] : rows[-1] + 1] for key in (s.STATE, s.ACTION)))
-    edit_table(root / DATA, lambda table: table.update({key: one.tolist() for key, one in columns.items()}))
+    edit_table(
+        root / DATA, lambda table: table.update({key: one.tolist() for key, one in columns.items()})
+    )
 
 
 def some(rng: Rng, share: int = 4) -> list[int]:
@@ -49,20 +55,29 @@ def show(root: Path, pictures: dict[str, np.ndarray]) -> None:
 
 def counts(root: Path, rng: Rng) -> str:
     key = str(rng.choice(["total_episodes", "total_frames", "total_tasks"]))
-    edit_json(root / layout.INFO, lambda info: info.update({key: info[key] + int(rng.choice([-1, 1, 5]))}))
+    edit_json(
+        root / layout.INFO, lambda info: info.update({key: info[key] + int(rng.choice([-1, 1, 5]))})
+    )
     return r"meta/info.json.*(counts \d+ frames|total_(episodes|tasks): \d+; expected)"
 
 
 def rows(root: Path, rng: Rng) -> str:
-    key, row = str(rng.choice(["length", "dataset_from_index", "episode_index"])), int(rng.integers(1, COUNT))
+    key, row = (
+        str(rng.choice(["length", "dataset_from_index", "episode_index"])),
+        int(rng.integers(1, COUNT)),
+    )
     edit_table(root / EPISODES, lambda table: table[key].__setitem__(row, table[key][row] + 3))
     return "meta/episodes: .*; expected"
 
 
 def names(root: Path, rng: Rng) -> str | None:
-    wrong = [None, ["width", "height", "channels"], ["channels", "height", "width"]][rng.integers(3)]
+    wrong = [None, ["width", "height", "channels"], ["channels", "height", "width"]][
+        rng.integers(3)
+    ]
     for key in Dataset.open(root).cameras:
-        edit_json(root / layout.INFO, lambda info, key=key: info["features"][key].update(names=wrong))
+        edit_json(
+            root / layout.INFO, lambda info, key=key: info["features"][key].update(names=wrong)
+        )
         return f"error    meta/info.json: {key}: .* LeRobot cannot train; set .*channels"
     return None
 
@@ -73,34 +88,53 @@ def frames(root: Path, rng: Rng) -> str:
     for key in dataset.cameras:
         pictures, fewer = dataset.frames(key, np.arange(len(dataset))), rng.random() < 0.5
         if fewer and dataset.features[key].dtype == "image":
-            edit_table(root / DATA, lambda table, key=key: table[key].__setitem__(lost, {"bytes": None, "path": None}))
+            edit_table(
+                root / DATA,
+                lambda table, key=key: table[key].__setitem__(lost, {"bytes": None, "path": None}),
+            )
             return f"{DATA}: {key}: 1 of .* rows have no picture"
         show(root, {key: pictures[:-lost] if fewer else pictures[:, :40]})
-        return r"videos/.*: \d+ frames for \d+ rows" if fewer else r".*pictures are 40 x 64; expected 48 x 64"
+        return (
+            r"videos/.*: \d+ frames for \d+ rows"
+            if fewer
+            else r".*pictures are 40 x 64; expected 48 x 64"
+        )
     pq.write_table(pq.read_table(root / DATA).slice(0, len(dataset) - lost), root / DATA)
     return r"meta/info.json.*counts \d+ frames, its data files \d+"
 
 
 def finite(root: Path, rng: Rng) -> str:
-    key, row, value = str(rng.choice([s.STATE, s.ACTION])), int(rng.integers(100)), rng.choice([np.nan, np.inf])
+    key, row, value = (
+        str(rng.choice([s.STATE, s.ACTION])),
+        int(rng.integers(100)),
+        rng.choice([np.nan, np.inf]),
+    )
     edit_table(root / DATA, lambda table: table[key].__setitem__(row, [float(value)] * 5))
     return f"data: {key}: not finite in row {row} "
 
 
 def times(root: Path, rng: Rng) -> str:
     scale = float(rng.choice([0.5, 0.97, 1.1]))
-    edit_table(root / DATA, lambda table: table.update(timestamp=[time * scale for time in table["timestamp"]]))
+    edit_table(
+        root / DATA,
+        lambda table: table.update(timestamp=[time * scale for time in table["timestamp"]]),
+    )
     return r"data: timestamp at \d+ frames per second: .*; expected"
 
 
 def statistics(root: Path, rng: Rng) -> str:
     key, name = str(rng.choice([s.STATE, s.ACTION])), str(rng.choice(["min", "max", "mean", "std"]))
-    edit_json(root / layout.STATS, lambda stats: stats[key][name].__setitem__(2, stats[key][name][2] + 0.05))
+    edit_json(
+        root / layout.STATS,
+        lambda stats: stats[key][name].__setitem__(2, stats[key][name][2] + 0.05),
+    )
     return f"stats.json: {key}: {name} is .*expected"
 
 
 def died(root: Path, rng: Rng) -> str:
-    name = str(rng.choice([DATA, EPISODES, "images/x/frame.png", "tmpab12cd_9/x.mp4", "meta/.x.partial"]))
+    name = str(
+        rng.choice([DATA, EPISODES, "images/x/frame.png", "tmpab12cd_9/x.mp4", "meta/.x.partial"])
+    )
     if (root / name).exists():
         cut(root / name, float(rng.uniform(0.3, 0.95)))
         return f"{name}: "
@@ -146,7 +180,10 @@ def lag(root: Path, rng: Rng) -> str:
 
 def cameras(root: Path, rng: Rng) -> str | None:
     """Frozen, black or swapped in some episodes."""
-    dataset, what = Dataset.open(root), str(rng.choice(["is frozen", "is black", "is swapped with"]))
+    dataset, what = (
+        Dataset.open(root),
+        str(rng.choice(["is frozen", "is black", "is swapped with"])),
+    )
     if not dataset.cameras:
         return None
     seen = {key: dataset.frames(key, np.arange(len(dataset))).copy() for key in dataset.cameras}
@@ -155,7 +192,11 @@ def cameras(root: Path, rng: Rng) -> str | None:
         if what == "is swapped with":
             left[part], right[part] = right[part].copy(), left[part].copy()
         else:
-            left[part] = left[part[0]] if what == "is frozen" else rng.integers(0, 8, left[part].shape, np.uint8)
+            left[part] = (
+                left[part[0]]
+                if what == "is frozen"
+                else rng.integers(0, 8, left[part].shape, np.uint8)
+            )
     show(root, seen)
     return f"{dataset.cameras[0]}: {what} .*3 of 12 episodes"
 
@@ -193,7 +234,10 @@ def wraps(root: Path, rng: Rng) -> str:
             values[:, place] = (half * np.linspace(1.9, 2.1, len(values))) % (2 * half) - half
 
     move(root, change, chosen := some(rng))
-    return rf"observation.state: .* jump by a turn at .* \(episodes {', '.join(map(str, chosen))}\): relative actions"
+    return (
+        rf"observation.state: .* jump by a turn at .* \(episodes {', '.join(map(str, chosen))}\):"
+        r" relative actions"
+    )
 
 
 PLANTS: tuple[Plant, ...] = (
@@ -221,6 +265,10 @@ def test_planted_defects_are_found(made, tmp_path, plant):
         if (wanted := plant(copy, np.random.default_rng(number))) is not None:
             planted += 1
             lines = [str(one) for one in examine_folder(copy)]
-            missed += [] if any(re.search(wanted, line) for line in lines) else [f"{root.name}: {wanted}: {lines}"]
+            missed += (
+                []
+                if any(re.search(wanted, line) for line in lines)
+                else [f"{root.name}: {wanted}: {lines}"]
+            )
     print(f"{plant.__name__}: {planted - len(missed)} of {planted}")
     assert len(missed) <= 0.05 * planted, "\n".join(missed)

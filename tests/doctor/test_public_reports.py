@@ -1,7 +1,9 @@
-"""What users of LeRobot report of their datasets, tried here: each works, or is refused in one line that helps.
+"""What users of LeRobot report of their datasets, tried here: each works, or is refused in one line
+that helps.
 
-Others are shown beside what they concern: fps 29.97 and exchanged messages in `tests/mcap`, another program's dataset
-and its card in `tests/store/test_cards.py`, datasets of every shape that is trained on in `tests/data`.
+Others are shown beside what they concern: fps 29.97 and exchanged messages in `tests/mcap`, another
+program's dataset and its card in `tests/store/test_cards.py`, datasets of every shape that is
+trained on in `tests/data`.
 """
 
 import shutil
@@ -33,7 +35,9 @@ def index_without_a_name(root: Path) -> Path:
     table = pq.read_table(next(root.glob(layout.EPISODES_FILES)))
     texts = [[TEXT]] * len(table)
     place = table.column_names.index("tasks")
-    pq.write_table(table.set_column(place, "tasks", [texts]), next(root.glob(layout.EPISODES_FILES)))
+    pq.write_table(
+        table.set_column(place, "tasks", [texts]), next(root.glob(layout.EPISODES_FILES))
+    )
     return root
 
 
@@ -43,12 +47,16 @@ def modified(root: Path) -> Path:
 
 
 def merged(root: Path) -> Path:
-    merge_datasets([theirs(root), theirs(modified(root))], "local/new", output_dir=root.with_name("new"))
+    merge_datasets(
+        [theirs(root), theirs(modified(root))], "local/new", output_dir=root.with_name("new")
+    )
     return root.with_name("new")
 
 
 @pytest.mark.parametrize("change", [index_without_a_name, merged])
-def test_a_dataset_that_lerobots_tools_changed_goes_through_every_command(change, tmp_path: Path, capsys):
+def test_a_dataset_that_lerobots_tools_changed_goes_through_every_command(
+    change, tmp_path: Path, capsys
+):
     original = shutil.copytree(SAMPLE, tmp_path / "demos")
     root = change(original)
     assert main(["data", "check", str(root)]) == 0

@@ -52,7 +52,10 @@ def test_a_damaged_dataset_is_rebuilt_from_its_journals_and_kept(ours):
     cut(ours / DATA, 0.5)
     damaged = digests(ours)
     kept = ours.with_name("ours.before-repair")
-    assert mend(ours) == ["rebuilt from ours.journals: 12 episodes", f"replaced and moved files are kept in {kept}"]
+    assert mend(ours) == [
+        "rebuilt from ours.journals: 12 episodes",
+        f"replaced and moved files are kept in {kept}",
+    ]
     assert (digests(ours), digests(kept)) == (whole, damaged)
 
 
@@ -60,20 +63,27 @@ def test_journals_that_hold_less_than_the_dataset_replace_nothing(ours):
     list_episodes(ours.with_name("ours.journals"))[0].unlink()
     (ours / layout.TASKS).unlink()
     before = digests(ours)
-    assert mend(ours)[0] == "not rebuilt: ours.journals holds 11 episodes, but 12 are still readable"
+    assert (
+        mend(ours)[0] == "not rebuilt: ours.journals holds 11 episodes, but 12 are still readable"
+    )
     assert digests(ours) == before
 
 
 def test_counts_statistics_and_leftovers_are_mended_without_journals(theirs):
     whole = json.loads((theirs / layout.STATS).read_text())
     edit_json(theirs / layout.INFO, lambda info: info.update(total_frames=3, total_episodes=1))
-    edit_json(theirs / layout.STATS, lambda stats: (stats.pop(FRONT), stats[s.ACTION].update(mean=[9] * 5)))
+    edit_json(
+        theirs / layout.STATS,
+        lambda stats: (stats.pop(FRONT), stats[s.ACTION].update(mean=[9] * 5)),
+    )
     (theirs / "images").mkdir(exist_ok=True)
     (theirs / "images/left.png").write_bytes(b"x")
     mend(theirs)
     assert examine_folder(theirs) == []
     stats = json.loads((theirs / layout.STATS).read_text())
-    np.testing.assert_allclose(stats[s.ACTION]["mean"], whole[s.ACTION]["mean"], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        stats[s.ACTION]["mean"], whole[s.ACTION]["mean"], rtol=1e-4, atol=1e-6
+    )
     np.testing.assert_allclose(stats[FRONT]["mean"], whole[FRONT]["mean"], atol=0.05)
     kept = theirs.with_name("theirs.before-repair")
     assert sorted(path.name for path in kept.iterdir()) == ["images", "info.json", "stats.json"]
@@ -81,7 +91,11 @@ def test_counts_statistics_and_leftovers_are_mended_without_journals(theirs):
 
 def shift(root: Path, mean: float) -> dict[str, list[float]]:
     """Move the actions to a mean, with a deviation of 0.3; return LeRobot's statistics of them."""
-    values = np.random.default_rng(0).normal(mean, 0.3, (Dataset.open(root).info.frames, 5)).astype(np.float32)
+    values = (
+        np.random.default_rng(0)
+        .normal(mean, 0.3, (Dataset.open(root).info.frames, 5))
+        .astype(np.float32)
+    )
     edit_table(root / DATA, lambda table: table.update({s.ACTION: values.tolist()}))
     found = compute_episode_stats({s.ACTION: values}, {s.ACTION: {"dtype": "float32"}})[s.ACTION]
     return {name: one.tolist() for name, one in found.items()}
@@ -92,14 +106,21 @@ def wrong_statistics(root: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("mean", [2048, 10_000])
-def test_a_deviation_that_float32_lost_beside_a_large_mean_is_found_and_computed_again(theirs, mean):
+def test_a_deviation_that_float32_lost_beside_a_large_mean_is_found_and_computed_again(
+    theirs, mean
+):
     stats = shift(theirs, mean)
     for std in (stats["std"], [0.0] * 5, [0.6] * 5):
-        edit_json(theirs / layout.STATS, lambda table, std=std: table.update({s.ACTION: stats | {"std": std}}))
+        edit_json(
+            theirs / layout.STATS,
+            lambda table, std=std: table.update({s.ACTION: stats | {"std": std}}),
+        )
         assert [line for line in wrong_statistics(theirs) if f"{s.ACTION}: std is" in line], std
     mend(theirs)
     assert wrong_statistics(theirs) == []
-    assert json.loads((theirs / layout.STATS).read_text())[s.ACTION]["std"] == pytest.approx([0.3] * 5, rel=0.1)
+    assert json.loads((theirs / layout.STATS).read_text())[s.ACTION]["std"] == pytest.approx(
+        [0.3] * 5, rel=0.1
+    )
 
 
 @pytest.mark.parametrize("mean", [0, 1.5, 90])
@@ -122,7 +143,9 @@ def test_what_a_link_leads_to_is_not_changed(theirs):
 def test_lerobots_tool_deletes_the_episodes_that_a_remedy_names(theirs, warm_lerobot: Warm):
     edit_table(theirs / DATA, lambda table: table[s.ACTION].__setitem__(4, [float("nan")] * 5))
     [finding] = [one for one in examine_folder(theirs) if "not finite" in one.text]
-    done = warm_lerobot.run(*shlex.split(finding.remedy.partition("delete them: ")[2]), folder=theirs.parent)
+    done = warm_lerobot.run(
+        *shlex.split(finding.remedy.partition("delete them: ")[2]), folder=theirs.parent
+    )
     assert done.returncode == 0, done.stderr
     assert lines(theirs.with_name("theirs_kept")) == []
 

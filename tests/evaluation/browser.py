@@ -28,7 +28,10 @@ class Opened:
         return self.page.evaluate(script, argument)
 
     def wait_until(self, script: str, argument: object = None, seconds: float = PATIENCE) -> None:
-        """Wait until that is true. Playwright's `wait_for_function` evaluates in the page, which a page may forbid."""
+        """Wait until that is true.
+
+        Playwright's `wait_for_function` evaluates in the page, which a page may forbid.
+        """
         end = time.monotonic() + seconds
         while not self.evaluate(script, argument):
             assert time.monotonic() < end, f"not within {seconds:g} s: {script}"
@@ -42,15 +45,21 @@ def chromium() -> Iterator[Browser]:
     assert found, f"no Chromium ({', '.join(NAMES)}) on the PATH; as root: .ci/system browser"
     with sync_playwright() as playwright:
         # Its sandbox cannot be had as root, nor in most containers; the pages are our own.
-        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"], timeout=1000 * PATIENCE)
+        browser = playwright.chromium.launch(
+            executable_path=found, args=["--no-sandbox"], timeout=1000 * PATIENCE
+        )
         yield browser
         browser.close()
 
 
 @contextmanager
-def opened(browser: Browser, path: Path, width: int, scheme: Literal["light", "dark"] = "light") -> Iterator[Opened]:
+def opened(
+    browser: Browser, path: Path, width: int, scheme: Literal["light", "dark"] = "light"
+) -> Iterator[Opened]:
     """`path` in a window of this width [px], without a network."""
-    context = browser.new_context(viewport={"width": width, "height": HEIGHT}, color_scheme=scheme, offline=True)
+    context = browser.new_context(
+        viewport={"width": width, "height": HEIGHT}, color_scheme=scheme, offline=True
+    )
     context.set_default_timeout(1000 * PATIENCE)
     page = context.new_page()
     window, own = Opened(page), path.resolve().as_uri()

@@ -40,10 +40,15 @@ def made_eval(
     for number in range(n):
         good = not fails(number)
         phase = "at_goal" if good else phases[number // 3 % len(phases)]
-        detail = {"condition": conditions[number % len(conditions)], "steps_to_success": 40 if good else None}
+        detail = {
+            "condition": conditions[number % len(conditions)],
+            "steps_to_success": 40 if good else None,
+        }
         episodes.append(EpisodeResult(FIRST_SEED + number, good, good, 100, -20.0, phase, detail))
     fingerprint = {"mujoco": "3.11.0", "model_sha256": "ab" * 32}
-    return EvalResult(policy, "panda", "pick_place", fingerprint, tuple(episodes), EvalSettings(100, 0.02))
+    return EvalResult(
+        policy, "panda", "pick_place", fingerprint, tuple(episodes), EvalSettings(100, 0.02)
+    )
 
 
 def made_pair(left: Fails, right: Fails, seeds: int = 1) -> Study:
@@ -55,11 +60,16 @@ def made_pair(left: Fails, right: Fails, seeds: int = 1) -> Study:
     return Study(sides, "runs/cloning")
 
 
-def made_side(name: str, results: Sequence[EvalResult], successes: tuple[float, ...], labels: int = 100) -> Side:
+def made_side(
+    name: str, results: Sequence[EvalResult], successes: tuple[float, ...], labels: int = 100
+) -> Side:
     """A side of runs, one per result, whose rounds had these successes on validation."""
     run = history(records(successes, labels), name)
     chosen = Rule().select(run, name)
-    members = (Member(Path(name) / f"seed_{i}", i, run, Path("p"), chosen, one) for i, one in enumerate(results))
+    members = (
+        Member(Path(name) / f"seed_{i}", i, run, Path("p"), chosen, one)
+        for i, one in enumerate(results)
+    )
     return Side(name, tuple(members))
 
 

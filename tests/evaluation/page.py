@@ -41,17 +41,23 @@ class Page(HTMLParser):
     @property
     def figures(self) -> list[str]:
         """What each figure shows, in words."""
-        return [a["alt"] or "" for tag, a in self.tags if tag == "img" and "svg" in (a["src"] or "")]
+        return [
+            a["alt"] or "" for tag, a in self.tags if tag == "img" and "svg" in (a["src"] or "")
+        ]
 
 
 def page_of(report: Report) -> Page:
-    """The page, which closes all elements, runs no script, reaches nothing outside and begins with its verdict."""
+    """The page, which closes all elements, runs no script, reaches nothing outside and begins
+    with its verdict.
+    """
     html = report.render()
     assert html == report.render()
     page = Page(html)
     assert page.open == []
     assert not re.search(r"(?<!&#34;)https?:|@import|url\(|<script", html)
-    assert any("default-src 'none'" in (attributes.get("content") or "") for _, attributes in page.tags)
+    assert any(
+        "default-src 'none'" in (attributes.get("content") or "") for _, attributes in page.tags
+    )
     for tag, attributes in page.tags:
         assert tag != "script"
         assert not any(name.startswith("on") for name in attributes)

@@ -14,7 +14,14 @@ from manip_il.worlds.ladder.world import make_env, scene_of
 from manip_il.worlds.table import env_fingerprint, make_config
 
 HORIZON = 50
-SETTINGS = {"cases": 4, "seed": 0, "horizon": HORIZON, "control_hz": 20, "tolerance": 0.02, "success_steps": 5}
+SETTINGS = {
+    "cases": 4,
+    "seed": 0,
+    "horizon": HORIZON,
+    "control_hz": 20,
+    "tolerance": 0.02,
+    "success_steps": 5,
+}
 ACTIONS = (Case(1, 3, 10, 9), Case(2, 0, 30, 10), Case(3, 9, None, 7), Case(4, 2, 8, 9))
 
 
@@ -23,7 +30,10 @@ def row(group: str, cases: tuple[Case, ...], name: str = "a", left_out: int = 0)
 
 
 def certificate(*rows: Row) -> Certificate:
-    start, state = row("start", (Case(1, 0, 12),), "start"), row("state", (Case(1, 2, 9),), "state", 3)
+    start, state = (
+        row("start", (Case(1, 0, 12),), "start"),
+        row("state", (Case(1, 2, 9),), "state", 3),
+    )
     return Certificate("panda", "pick_place", {"mujoco": "3"}, SETTINGS, (start, state, *rows))
 
 
@@ -49,7 +59,12 @@ def test_the_file_holds_every_case_and_what_follows_from_them():
     assert action["cases"] == [[1, 3, 10, 9], [2, 0, 30, 10], [3, 9, None, 7], [4, 2, 8, 9]]
     assert (action["n"], action["left_out"], action["success_rate"]) == (4, 2, 0.75)
     assert action["interval"] == list(wilson_interval(3, 4))
-    assert (empty["n"], empty["left_out"], empty["success_rate"], empty["interval"]) == (0, 4, None, None)
+    assert (empty["n"], empty["left_out"], empty["success_rate"], empty["interval"]) == (
+        0,
+        4,
+        None,
+        None,
+    )
 
 
 @pytest.mark.parametrize("kind", ["random", "opposite"])
@@ -74,7 +89,9 @@ def test_costs_are_those_of_stepping_the_simulator_by_hand(measured: Certificate
 
 
 def test_every_kind_has_its_row_and_every_case_its_moment_on_the_experts_way(measured: Certificate):
-    assert [row.kind for row in measured.rows] == [*("start", "jolt", "dropped", "open", "random", "opposite", "noise")]
+    assert [row.kind for row in measured.rows] == [
+        *("start", "jolt", "dropped", "open", "random", "opposite", "noise")
+    ]
     whole = {case.seed: case.steps or 0 for case in measured.of("start")[0].cases}
     for one in [*measured.of("state"), *measured.of("action")]:
         assert len(one.cases) + one.left_out == 3
@@ -85,8 +102,9 @@ def test_every_kind_has_its_row_and_every_case_its_moment_on_the_experts_way(mea
     assert count_episodes(make_config(), 3) == 3 * len(measured.rows)
 
 
-# 500 cases a kind gave 100 % each. By the binomial, an expert as good as that falls under a floor in one or two of a
-# thousand draws of CASES seeds, and one that fails in 5 % of the changed states in 19 of 20.
+# 500 cases a kind gave 100 % each. By the binomial, an expert as good as that falls under a floor
+# in one or two of a thousand draws of CASES seeds, and one that fails in 5 % of the changed states
+# in 19 of 20.
 CASES = 40
 FLOORS = {"start": 0.96, "state": 0.98, "action": 0.98}
 MEAN_COST, COST_95 = 8.0, 36  # of a wrong action [control steps]: the mean was 4.0

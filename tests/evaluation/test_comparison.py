@@ -1,4 +1,6 @@
-"""A comparison is paired by training seed and by test episode, and says no more than its numbers show."""
+"""A comparison is paired by training seed and by test episode, and says no more than its numbers
+show.
+"""
 
 import json
 from dataclasses import replace
@@ -22,17 +24,26 @@ HARD = [True] * 50 + [False] * 50
 
 
 def result(outcomes: list[bool], **changes: Any) -> EvalResult:
-    episodes = tuple(EpisodeResult(FIRST_SEED + i, good, good, 10, 0.0) for i, good in enumerate(outcomes))
-    return replace(EvalResult("p", "panda", "reach", {"mujoco": "3.11.0"}, episodes, SETTINGS), **changes)
+    episodes = tuple(
+        EpisodeResult(FIRST_SEED + i, good, good, 10, 0.0) for i, good in enumerate(outcomes)
+    )
+    return replace(
+        EvalResult("p", "panda", "reach", {"mujoco": "3.11.0"}, episodes, SETTINGS), **changes
+    )
 
 
 def side(name: str, *outcomes: list[bool], **changes: Any) -> Side:
     results = [result(one, **changes) for one in outcomes]
-    return Side(name, tuple(Member(Path(name), seed, result=one) for seed, one in enumerate(results)))
+    return Side(
+        name, tuple(Member(Path(name), seed, result=one) for seed, one in enumerate(results))
+    )
 
 
 def test_one_policy_against_another_is_the_paired_comparison():
-    comparison, paired = Comparison(side("A", HARD), side("B", EASY)), PairCounts.of(zip(HARD, EASY, strict=True))
+    comparison, paired = (
+        Comparison(side("A", HARD), side("B", EASY)),
+        PairCounts.of(zip(HARD, EASY, strict=True)),
+    )
     assert comparison.difference == pytest.approx(0.3)
     assert comparison.interval == paired.interval
     assert comparison.verdict.startswith("B is better than A by 30.0 points [20.")
@@ -40,13 +51,17 @@ def test_one_policy_against_another_is_the_paired_comparison():
 
 
 def test_the_verdict_names_the_better_one_on_either_side_and_no_small_difference():
-    assert Comparison(side("A", EASY), side("B", HARD)).verdict.startswith("A is better than B by 30.0 points [20.")
+    assert Comparison(side("A", EASY), side("B", HARD)).verdict.startswith(
+        "A is better than B by 30.0 points [20."
+    )
     verdict = Comparison(side("A", HARD), side("B", HARD[:-1] + [True])).verdict
     assert verdict.startswith("No difference shown between B and A: +1.0 points [")
 
 
 def test_over_training_seeds_the_mean_difference_has_students_interval():
-    better = Comparison(side("A", HARD, HARD, HARD), side("B", EASY, EASY[1:] + [True], EASY[:-1] + [False]))
+    better = Comparison(
+        side("A", HARD, HARD, HARD), side("B", EASY, EASY[1:] + [True], EASY[:-1] + [False])
+    )
     assert [pair.difference for pair in better.pairs] == pytest.approx([0.3, 0.31 - 0.01, 0.3])
     assert better.significant
     assert "100 paired episodes on each of 3 training seeds, ahead in 3" in better.verdict
@@ -68,7 +83,9 @@ def test_random_arms_of_one_quality_are_seldom_called_different():
     wrong = 0
     for _ in range(400):
         drawn = rng.random((2, 3, 40)) < difficulty
-        wrong += Comparison(*(side(name, *one.tolist()) for name, one in zip("AB", drawn, strict=True))).significant
+        wrong += Comparison(
+            *(side(name, *one.tolist()) for name, one in zip("AB", drawn, strict=True))
+        ).significant
     assert wrong <= 32  # 3 standard deviations above 5 %
 
 
@@ -101,7 +118,10 @@ def row(study: Study, name: str) -> dict[str, str]:
 
 
 def test_the_headline_names_the_best_or_which_of_two_is_better():
-    rates = "dagger solves 80.0 % of 100 unseen starts, the mean of 2 training seeds; dart 51.0 %, cloning 50.0 %."
+    rates = (
+        "dagger solves 80.0 % of 100 unseen starts, the mean of 2 training seeds; dart 51.0 %,"
+        " cloning 50.0 %."
+    )
     assert STUDY.verdict == rates
     two = replace(STUDY, sides=STUDY.sides[:2])
     assert two.verdict == two.comparisons["dagger"].verdict

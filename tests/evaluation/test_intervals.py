@@ -1,4 +1,6 @@
-"""Intervals and tests agree with published tables, or with counting every flip of signs, and keep their properties."""
+"""Intervals and tests agree with published tables, or with counting every flip of signs, and
+keep their properties.
+"""
 
 import itertools
 import random
@@ -52,7 +54,8 @@ def test_a_confidence_sequence_holds_at_every_look_where_wilsons_does_not():
 @pytest.mark.parametrize(
     ("table", "low", "high"),
     [
-        # Fagerland, Lydersen, Laake (2014), Statistics in Medicine 33, 2850-2875: both worked examples
+        # Fagerland, Lydersen, Laake (2014), Statistics in Medicine 33, 2850-2875: both worked
+        # examples
         ((1, 1, 7, 12), -0.507, -0.026),
         ((59, 6, 16, 80), -0.1186, -0.0046),
         # Altman et al. (2000), Statistics with Confidence, table 6.2
@@ -64,19 +67,32 @@ def test_newcombes_paired_interval_agrees_with_worked_examples(
 ):
     digits = 5e-5 if round(low, 3) != low else 5e-4
     both, only_first, only_second, neither = table
-    assert PairCounts(both, only_second, only_first, neither).interval == pytest.approx((low, high), abs=digits)
+    assert PairCounts(both, only_second, only_first, neither).interval == pytest.approx(
+        (low, high), abs=digits
+    )
 
 
 @pytest.mark.parametrize(
     ("only_a", "only_b", "p"),
-    [(1, 7, 18 / 256), (0, 5, 2 / 32), (0, 6, 2 / 64), (3, 3, 1.0), (0, 0, 1.0), (10, 2, 2 * 79 / 4096)],
+    [
+        (1, 7, 18 / 256),
+        (0, 5, 2 / 32),
+        (0, 6, 2 / 64),
+        (3, 3, 1.0),
+        (0, 0, 1.0),
+        (10, 2, 2 * 79 / 4096),
+    ],
 )
-def test_with_one_training_seed_the_test_is_mcnemars_with_the_exact_binomial(only_a: int, only_b: int, p: float):
+def test_with_one_training_seed_the_test_is_mcnemars_with_the_exact_binomial(
+    only_a: int, only_b: int, p: float
+):
     assert sign_flip_exact([-1] * only_a + [1] * only_b + [0] * 3) == pytest.approx(p, rel=1e-12)
 
 
 @given(outcomes)
-def test_the_paired_interval_contains_the_difference_and_changes_sign_with_the_order(pairs: list[tuple[bool, bool]]):
+def test_the_paired_interval_contains_the_difference_and_changes_sign_with_the_order(
+    pairs: list[tuple[bool, bool]],
+):
     a, b = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
     forward, backward = PairCounts.of(zip(a, b, strict=True)), PairCounts.of(zip(b, a, strict=True))
     low, high = forward.interval

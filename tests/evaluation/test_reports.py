@@ -1,4 +1,6 @@
-"""Every page says first how good, then why, escapes what it is given, and says no less if nothing or all fails."""
+"""Every page says first how good, then why, escapes what it is given, and says no less if
+nothing or all fails.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,8 +32,9 @@ def page() -> Page:
 def test_the_verdict_has_success_and_the_main_phase():
     phase, count = next(iter(RESULT.failures.items()))
     failed = 120 - RESULT.success.successes
-    assert REPORT.verdict == (
-        f"runs/a/best succeeds in {RESULT.success} of 120 unseen episodes of panda pick_place; "
+    assert (
+        REPORT.verdict
+        == f"runs/a/best succeeds in {RESULT.success} of 120 unseen episodes of panda pick_place; "
         f"{count} of its {failed} failures end in the phase {phase}."
     )
 
@@ -42,14 +45,23 @@ def test_every_condition_is_in_the_table(page: Page):
 
 
 def test_a_run_has_its_policies_their_curves_and_how_it_was_made():
-    sides = [Side.of("DAgger", RESULT, labels=1234, disturbed=RESULT), Side.of("cloning", RESULT, labels=400)]
+    sides = [
+        Side.of("DAgger", RESULT, labels=1234, disturbed=RESULT),
+        Side.of("cloning", RESULT, labels=400),
+    ]
     curve = Side("DAgger", (Member(Path("x"), history=RUN),))
     config = {"policy": {"hidden": 256, "name": None}}
-    page = page_of(run_report(sides, [curve], FILMS, title="t", verdict="DAgger wins.", command="c", config=config))
+    page = page_of(
+        run_report(
+            sides, [curve], FILMS, title="t", verdict="DAgger wins.", command="c", config=config
+        )
+    )
     for words in ("1,234", "policy: hidden: 256 name: null"):
         assert words in page.text
     curves = [words for words in page.figures if "Validation" in words]
-    assert curves == [f"Validation success over {cost}: DAgger" for cost in ("labels", "episodes", "seconds")]
+    assert curves == [
+        f"Validation success over {cost}: DAgger" for cost in ("labels", "episodes", "seconds")
+    ]
 
 
 def test_a_comparison_tells_which_is_better_and_where_they_fail():
@@ -65,7 +77,9 @@ def test_whatever_comes_from_outside_is_escaped():
     evil = replace(made, robot=EVIL, task=EVIL, fingerprint={EVIL: EVIL})
     assert (
         page_of(
-            replace(eval_report(evil, [Film(EVIL, MP4, EVIL)], EVIL), command=EVIL, config={EVIL: EVIL})
+            replace(
+                eval_report(evil, [Film(EVIL, MP4, EVIL)], EVIL), command=EVIL, config={EVIL: EVIL}
+            )
         ).text.count("alert")
         > 20
     )
@@ -75,7 +89,10 @@ def test_whatever_comes_from_outside_is_escaped():
 
 
 def test_a_figure_is_the_same_bytes_and_fits_a_phone():
-    sides = [replace(SELDOM.sides[1], name="a $name_of$ many words that is rather long"), SELDOM.sides[0]]
+    sides = [
+        replace(SELDOM.sides[1], name="a $name_of$ many words that is rather long"),
+        SELDOM.sides[0],
+    ]
     once, again = curve_figures(sides)[0], curve_figures(sides)[0]
     assert once.svg == again.svg
     assert once.width <= 480  # or it would not be readable on a phone

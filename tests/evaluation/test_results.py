@@ -1,4 +1,6 @@
-"""`eval.json` keeps its contract, survives a round trip, and says what is wrong with a broken file."""
+"""`eval.json` keeps its contract, survives a round trip, and says what is wrong with a broken
+file.
+"""
 
 import json
 from dataclasses import replace
@@ -29,11 +31,34 @@ def result(outcomes: list[bool], first_seed: int = 100, **changes: Any) -> EvalR
 def test_the_keys_are_the_contracts():
     data = result([True, True, False]).to_json()
     assert set(data) == {
-        *("success_rate", "interval", "confidence", "n_episodes", "policy", "robot", "task", "fingerprint"),
-        *("episodes", "success_at_end_rate", "settings", "interval_method", "until_width", "by_condition"),
+        *(
+            "success_rate",
+            "interval",
+            "confidence",
+            "n_episodes",
+            "policy",
+            "robot",
+            "task",
+            "fingerprint",
+        ),
+        *(
+            "episodes",
+            "success_at_end_rate",
+            "settings",
+            "interval_method",
+            "until_width",
+            "by_condition",
+        ),
         "policy_sha256",
     }
-    assert set(data["episodes"][0]) == {"seed", "success", "success_at_end", "steps", "return", "phase_at_end"}
+    assert set(data["episodes"][0]) == {
+        "seed",
+        "success",
+        "success_at_end",
+        "steps",
+        "return",
+        "phase_at_end",
+    }
     assert data["settings"] == {
         **{"horizon": 150, "tolerance": 0.02, "control_hz": 20, "success_steps": 5},
         **{"hold": None, "suite": "nominal", "conditions": [{"name": "nominal"}], "object": ""},
@@ -55,9 +80,13 @@ def test_what_is_written_is_read_back_equal(tmp_path: Path):
 
 def test_success_is_split_by_condition_in_the_order_of_the_settings():
     made = result([True, False, True, True])
-    named = tuple(replace(one, detail={"condition": "ab"[i % 2]}) for i, one in enumerate(made.episodes))
+    named = tuple(
+        replace(one, detail={"condition": "ab"[i % 2]}) for i, one in enumerate(made.episodes)
+    )
     conditions = tuple(Condition(name, mass=(0.1, 0.2)) for name in "ba")
-    suite = replace(made, episodes=named, settings=replace(SETTINGS, suite="mine", conditions=conditions))
+    suite = replace(
+        made, episodes=named, settings=replace(SETTINGS, suite="mine", conditions=conditions)
+    )
     parts = suite.to_json()["by_condition"]
     counts = [(name, part["success_rate"], part["n_episodes"]) for name, part in parts.items()]
     assert counts == [("b", 0.5, 2), ("a", 1.0, 2)]
@@ -77,7 +106,9 @@ def compared(left: EvalResult, right: EvalResult) -> Comparison:
 
 
 def test_results_are_compared_on_the_seeds_they_share():
-    [pairs] = compared(result([True, False, False]), result([True, True], first_seed=101, policy="act")).pairs
+    [pairs] = compared(
+        result([True, False, False]), result([True, True], first_seed=101, policy="act")
+    ).pairs
     assert (pairs.n, pairs.only_right, pairs.only_left) == (2, 2, 0)
 
 
@@ -104,8 +135,13 @@ def test_parts_in_any_order_are_the_whole():
 
 
 def test_a_policy_is_the_same_wherever_it_lay():
-    assert merge_results({"a": part(0, [True]), "b": part(1, [True], policy="/policy/x")}).success.n == 2
-    without_files = {name: part(i, [True], policy=name, policy_sha256="") for i, name in enumerate(["a", "b"])}
+    assert (
+        merge_results({"a": part(0, [True]), "b": part(1, [True], policy="/policy/x")}).success.n
+        == 2
+    )
+    without_files = {
+        name: part(i, [True], policy=name, policy_sha256="") for i, name in enumerate(["a", "b"])
+    }
     with pytest.raises(MismatchError, match="policy differs"):
         merge_results(without_files)
 
@@ -117,7 +153,10 @@ def test_a_policy_is_the_same_wherever_it_lay():
         ({"robot": "fetch"}, "robot"),
         ({"task": "lift"}, "task"),
         ({"settings": EvalSettings(100, 0.05)}, "horizon"),
-        ({"settings": replace(SETTINGS, conditions=(Condition("k", mass=(0.1, 0.2)),))}, "conditions"),
+        (
+            {"settings": replace(SETTINGS, conditions=(Condition("k", mass=(0.1, 0.2)),))},
+            "conditions",
+        ),
     ],
 )
 def test_what_differs_is_named_with_both_sides(changes, what):

@@ -7,7 +7,9 @@ from manip_il.evaluation.rounds import Rule, history
 SUCCESS = (0.5, 0.9, 0.8, 0.9, 0.7)
 
 
-def records(successes: tuple[float, ...] = SUCCESS, labels: int = 100, seconds: float = 10.0) -> list[dict[str, Any]]:
+def records(
+    successes: tuple[float, ...] = SUCCESS, labels: int = 100, seconds: float = 10.0
+) -> list[dict[str, Any]]:
     return [
         {
             "round": i,
@@ -16,7 +18,12 @@ def records(successes: tuple[float, ...] = SUCCESS, labels: int = 100, seconds: 
             "episodes": 3 * (i + 1),
             "validation_success": success,
             "validation_episodes": 10,
-            "seconds": {"collect": seconds / 4, "fit": seconds / 2, "redraw": seconds / 4, "validate": 100.0},
+            "seconds": {
+                "collect": seconds / 4,
+                "fit": seconds / 2,
+                "redraw": seconds / 4,
+                "validate": 100.0,
+            },
         }
         for i, success in enumerate(successes)
     ]
@@ -27,11 +34,19 @@ RUN = history(records(), "runs/x")
 
 def test_validated_iterations_are_rounds_and_cost_what_all_before_them_took():
     lines = [
-        {"iteration": i, "steps": 100 * i, "episodes": 2 * i, "validation_success": rate, "validation_episodes": 10}
+        {
+            "iteration": i,
+            "steps": 100 * i,
+            "episodes": 2 * i,
+            "validation_success": rate,
+            "validation_episodes": 10,
+        }
         | {"seconds": {"collect": 1.0, "fit": 2.0, "validate": 4.0}}
         for i, rate in enumerate((0.2, None, 0.5))
     ]
-    found = [(one.unit, one.round, one.steps, one.labels, one.seconds) for one in history(lines, "x")]
+    found = [
+        (one.unit, one.round, one.steps, one.labels, one.seconds) for one in history(lines, "x")
+    ]
     assert found == [("iteration", 0, 0, 0, 3.0), ("iteration", 2, 200, 0, 9.0)]
 
 

@@ -32,8 +32,17 @@ def act(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def mlp(tmp_path_factory):
-    """A policy of one call for all episodes, fitted a little so that its actions differ from state to state."""
-    return clone(make_config("fetch"), 3, tmp_path_factory.mktemp("policy"), steps=60, width=64, batch_size=64)
+    """A policy of one call for all episodes, fitted a little so that its actions differ from
+    state to state.
+    """
+    return clone(
+        make_config("fetch"),
+        3,
+        tmp_path_factory.mktemp("policy"),
+        steps=60,
+        width=64,
+        batch_size=64,
+    )
 
 
 def job_of(policy, **changes) -> RolloutJob:
@@ -57,7 +66,10 @@ def test_outcomes_depend_on_no_batch_and_no_worker(kind, request):
 
 
 def test_an_episode_of_a_suite_is_that_of_its_condition_alone(act):
-    together = {one.seed: one for one in evaluate(Engine(1), job_of(act, conditions=ALL), SEEDS, "it").episodes}
+    together = {
+        one.seed: one
+        for one in evaluate(Engine(1), job_of(act, conditions=ALL), SEEDS, "it").episodes
+    }
     nominal = {one.seed: one for one in evaluate(Engine(1), job_of(act), SEEDS, "it").episodes}
     same = [seed for seed in SEEDS if together[seed].detail["end"] == nominal[seed].detail["end"]]
     assert same == [seed for seed in SEEDS if turn_of(ALL, seed) == NOMINAL]
@@ -81,7 +93,9 @@ def coins(monkeypatch):
     """Engines whose episodes come out as a list says."""
 
     def make(outcomes: list[bool]) -> Coins:
-        monkeypatch.setattr(runner, "episode_result", lambda job, one: result(one.seed, outcomes[one.seed]))
+        monkeypatch.setattr(
+            runner, "episode_result", lambda job, one: result(one.seed, outcomes[one.seed])
+        )
         return Coins()
 
     return make
@@ -113,7 +127,11 @@ def test_what_is_done_is_not_run_again_and_changes_nothing(coins):
         engine = coins(outcomes)
         done = {seed: result(seed, outcomes[seed]) for seed in range(0, 1_000, 3)}
         finished: list[EpisodeResult] = []
-        resumed = evaluate(engine, COIN, range(1_000), "coin", finished.append, done=done, until_width=width)
+        resumed = evaluate(
+            engine, COIN, range(1_000), "coin", finished.append, done=done, until_width=width
+        )
         assert resumed == whole
         assert not {one.seed for one in finished} & set(done)
-        assert sorted(one.seed for one in finished) == sorted(seed for asked in engine.asked for seed in asked)
+        assert sorted(one.seed for one in finished) == sorted(
+            seed for asked in engine.asked for seed in asked
+        )

@@ -10,10 +10,12 @@ from typing import Any
 
 
 def run_command(words: Sequence[str], log: str, warm: bool, largest_file: int) -> None:
-    """In a child: one command, as from a shell, in a session of its own, with all that it says in the file `log`.
+    """In a child: one command, as from a shell, in a session of its own, with all that it says in
+    the file `log`.
 
-    warm: what its workers are forked from has loaded everything, as this process has. largest_file: how large a file
-    may get [bytes], 0 for any size; the kernel then refuses to write as it does when a disk is full.
+    warm: what its workers are forked from has loaded everything, as this process has. largest_file:
+    how large a file may get [bytes], 0 for any size; the kernel then refuses to write as it does
+    when a disk is full.
     """
     from manip_il.cli.main import main
 
@@ -40,8 +42,12 @@ def fork_instead_of_spawning() -> None:
 
 
 def living(session: int) -> list[int]:
-    """Processes of a session, without those that only wait for their parent to look at how they ended."""
-    return [int(pid) for pid in os.listdir("/proc") if pid.isdecimal() and _is_alive_in(pid, session)]
+    """Processes of a session, without those that only wait for their parent to look at how they
+    ended.
+    """
+    return [
+        int(pid) for pid in os.listdir("/proc") if pid.isdecimal() and _is_alive_in(pid, session)
+    ]
 
 
 def _is_alive_in(pid: str, session: int) -> bool:
@@ -54,7 +60,9 @@ def _is_alive_in(pid: str, session: int) -> bool:
 
 
 def _fork_what_would_be_spawned(path: bytes, words: Sequence[Any], handles: Sequence[int]) -> int:
-    """`multiprocessing.util.spawnv_passfds` for a `python -c CODE` whose imports are done: seconds are saved."""
+    """`multiprocessing.util.spawnv_passfds` for a `python -c CODE` whose imports are done:
+    seconds are saved.
+    """
     pid = os.fork()
     if pid:
         return pid

@@ -1,4 +1,6 @@
-"""`record`, `dagger` and `eval`, killed at any moment and again and again, lose what was in progress and no more."""
+"""`record`, `dagger` and `eval`, killed at any moment and again and again, lose what was in
+progress and no more.
+"""
 
 import json
 import os
@@ -20,11 +22,25 @@ PATIENCE = 600.0  # for a command that is not killed, and for the end of one tha
 REACH = ("--robot.type=fetch", "--task.type=reach", "--env.horizon=60")
 RECORD = ("record", *REACH, "--dataset.num_episodes=8", "--dataset.root={folder}/out/demos")
 DAGGER = (
-    *("dagger", *REACH, "--rounds=1", "--demonstrations=3", "--episodes_per_round=4", "--steps=300"),
+    *(
+        "dagger",
+        *REACH,
+        "--rounds=1",
+        "--demonstrations=3",
+        "--episodes_per_round=4",
+        "--steps=300",
+    ),
     *("--policy.width=16", "--validation_episodes=4", "--workers=2", "--output_dir={folder}/out"),
 )
 EVAL = (
-    *("eval", *REACH, "--eval.n_episodes=16", "--eval.batch_size=2", "--eval.films=0", "--workers=2"),
+    *(
+        "eval",
+        *REACH,
+        "--eval.n_episodes=16",
+        "--eval.batch_size=2",
+        "--eval.films=0",
+        "--workers=2",
+    ),
     "--output_dir={folder}/out",
 )
 UNEQUAL = ("config.yaml", "report.html")  # they name the folder, and when what happened
@@ -40,7 +56,8 @@ class Command:
     folder: Path
 
     def begin(self) -> ForkServerProcess:
-        again = ("--resume=true",) if self.folder.is_dir() else ()  # also where the kill left nothing yet
+        # also where the kill left nothing yet
+        again = ("--resume=true",) if self.folder.is_dir() else ()
         self.folder.mkdir(exist_ok=True)
         words = [word.format(folder=self.folder) for word in self.words]
         return self.start(*words, *again, log=self.folder / "log", warm=True)
@@ -54,7 +71,10 @@ class Command:
         return time.monotonic() - started
 
     def kill(self, delay: float) -> bool:
-        """Kill it after so many seconds, and see its workers end; whether it was not done before."""
+        """Kill it after so many seconds, and see its workers end.
+
+        Whether it was not done before.
+        """
         process = self.begin()
         process.join(delay)
         if process.exitcode is not None:
@@ -72,15 +92,23 @@ class Command:
     def made(self) -> dict[str, object]:
         """All that must be the same, however often it was killed."""
         out = self.folder / "out"
-        files = {path.relative_to(out).as_posix(): path for path in out.rglob("*") if path.is_file()}
+        files = {
+            path.relative_to(out).as_posix(): path for path in out.rglob("*") if path.is_file()
+        }
         return {name: _content(path) for name, path in files.items() if path.name not in UNEQUAL}
 
     def episodes(self) -> dict[str, bytes]:
-        return {str(path.relative_to(self.folder)): path.read_bytes() for path in self.folder.rglob("episode-*.mcap")}
+        return {
+            str(path.relative_to(self.folder)): path.read_bytes()
+            for path in self.folder.rglob("episode-*.mcap")
+        }
 
 
 def _content(path: Path) -> object:
-    """A file's bytes; of a run's metrics all but the seconds, of finished episodes in whatever order they ended."""
+    """A file's bytes.
+
+    Of a run's metrics all but the seconds, of finished episodes in whatever order they ended.
+    """
     if path.name == "episodes.jsonl":
         return sorted(path.read_bytes().splitlines())
     if path.name != "metrics.jsonl":
@@ -105,7 +133,9 @@ def policy(start, tmp_path_factory) -> Path:
         pytest.param(EVAL, id="eval"),
     ],
 )
-def test_a_killed_command_takes_its_processes_along_and_goes_on_to_equal_bytes(words, start, policy, tmp_path):
+def test_a_killed_command_takes_its_processes_along_and_goes_on_to_equal_bytes(
+    words, start, policy, tmp_path
+):
     words = (*words, f"--policy.path={policy}") if words[0] == "eval" else words
     calm = Command(start, words, tmp_path / "calm")
     seconds = calm.run()
@@ -118,7 +148,8 @@ def test_a_killed_command_takes_its_processes_along_and_goes_on_to_equal_bytes(w
             before = again.episodes()
             was_killed = again.kill(rng.uniform(0, seconds))
             after = again.episodes()
-            assert before.items() <= after.items() <= episodes.items()  # finished ones stay, and are whole
+            # finished ones stay, and are whole
+            assert before.items() <= after.items() <= episodes.items()
             if not was_killed:
                 seconds *= 0.7  # it is faster now
                 break

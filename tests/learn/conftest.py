@@ -73,7 +73,9 @@ def gapped(table) -> Table:
     return table
 
 
-def write_table(table: Mapping[str, np.ndarray], root: Path, spec: EnvironmentSpec) -> tuple[Dataset, ...]:
+def write_table(
+    table: Mapping[str, np.ndarray], root: Path, spec: EnvironmentSpec
+) -> tuple[Dataset, ...]:
     """A dataset on disk, what the table lacks being zeros, pictures noise."""
     rng = np.random.default_rng(0)
     episodes = []

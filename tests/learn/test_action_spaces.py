@@ -37,11 +37,19 @@ EPISODES, LENGTH = 3, 12
 
 
 def moves(robot: str, rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Actions and states (rows, n) around the home posture, no step longer than the robot's longest."""
+    """Actions and states (rows, n) around the home posture, no step longer than the robot's
+    longest.
+    """
     the_robot, rng = get_robot(robot), np.random.default_rng(seed)
-    limits, longest, home = ArmIK(the_robot).limits, the_robot.max_joint_step, np.array(the_robot.home)
+    limits, longest, home = (
+        ArmIK(the_robot).limits,
+        the_robot.max_joint_step,
+        np.array(the_robot.home),
+    )
     joints = np.clip(home + rng.uniform(-0.4, 0.4, (rows, len(home))), limits[:, 0], limits[:, 1])
-    targets = np.clip(joints + rng.uniform(-longest, longest, joints.shape), limits[:, 0], limits[:, 1])
+    targets = np.clip(
+        joints + rng.uniform(-longest, longest, joints.shape), limits[:, 0], limits[:, 1]
+    )
     openings = rng.uniform(0, 0.08, (2, rows, 1))
     return np.hstack([targets, openings[0]]), np.hstack([joints, openings[1]])
 
@@ -49,12 +57,16 @@ def moves(robot: str, rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]
 def poses(robot: str, joints: np.ndarray) -> np.ndarray:
     """Position and rotation matrix of `ee`, (rows, 12), of joint values (rows, n)."""
     ik = ArmIK(get_robot(robot))
-    return np.array([np.concatenate([part.ravel() for part in ik.ee_pose(row[:-1])]) for row in joints])
+    return np.array(
+        [np.concatenate([part.ravel() for part in ik.ee_pose(row[:-1])]) for row in joints]
+    )
 
 
 @pytest.fixture(scope="module")
 def panda() -> EnvironmentSpec:
-    return EnvironmentSpec("panda", "reach", 20, get_robot("panda").joint_names, ("e0", "e1"), 5, "reach")
+    return EnvironmentSpec(
+        "panda", "reach", 20, get_robot("panda").joint_names, ("e0", "e1"), 5, "reach"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +87,9 @@ def sources(panda, table, tmp_path_factory) -> tuple[Dataset, ...]:
     return write_table(table, tmp_path_factory.mktemp("spaces") / "dataset", panda)
 
 
-def trainer_of(sources: tuple[Dataset, ...], folder: Path, settings: Any, space: str | None, **more: Any) -> Trainer:
+def trainer_of(
+    sources: tuple[Dataset, ...], folder: Path, settings: Any, space: str | None, **more: Any
+) -> Trainer:
     config = FitConfig(settings, action_space=space, eval_split=0.0, **SMALL, **more)
     return Trainer(sources, config, folder, resume=folder.is_dir())
 
@@ -85,7 +99,9 @@ def trainer_of(sources: tuple[Dataset, ...], folder: Path, settings: Any, space:
 def test_joint_spaces_lose_nothing(robot, space):
     actions, states = moves(robot, 20)
     there = Conversion(space, robot).encode(actions, states)
-    np.testing.assert_allclose(Conversion(space, robot).decode(there, states), actions, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        Conversion(space, robot).decode(there, states), actions, rtol=0, atol=1e-15
+    )
     measured = states[:, :-1] if space == JOINT_DELTA else 0.0
     np.testing.assert_array_equal(there[:, :-1], actions[:, :-1] - measured)
     np.testing.assert_array_equal(there[:, -1], actions[:, -1])
@@ -94,12 +110,22 @@ def test_joint_spaces_lose_nothing(robot, space):
 @pytest.mark.parametrize("settings", [{"width": 8}, ACT], ids=["mlp", "act"])
 def test_both_grippers_of_two_arms_are_absolute(settings, tmp_path):
     names = tuple(f"{side}_{number}" for side in ("left", "right") for number in range(7))
-    spec = EnvironmentSpec("aloha", "lift", 50, names, ("e0", "e1"), 5, "lift", action_meaning=TWO_ARMS)
+    spec = EnvironmentSpec(
+        "aloha", "lift", 50, names, ("e0", "e1"), 5, "lift", action_meaning=TWO_ARMS
+    )
     rng = np.random.default_rng(0)
     states, actions = rng.normal(size=(2, EPISODES * LENGTH, 14)).astype(np.float32)
     episodes = np.repeat(np.arange(EPISODES), LENGTH)
-    sources = write_table({STATE: states, ACTION: actions, "episode_index": episodes,
-                           "label_valid": np.ones((len(states), 1), np.int64)}, tmp_path / "data", spec)  # fmt: skip
+    sources = write_table(
+        {
+            STATE: states,
+            ACTION: actions,
+            "episode_index": episodes,
+            "label_valid": np.ones((len(states), 1), np.int64),
+        },
+        tmp_path / "data",
+        spec,
+    )
     path = trainer_of(sources, tmp_path / "run", settings, JOINT_DELTA).fit()
     found = Checkpoint.open(path)
     targets = Conversion(JOINT_DELTA, grippers=found.grippers).encode(actions, states)
@@ -133,14 +159,21 @@ def test_a_hand_motion_is_in_the_worlds_axes_and_a_far_one_is_approached(robot):
 
 
 @every_space
-def test_the_mlp_learns_each_space_from_the_same_table_and_gives_joint_targets(table, sources, tmp_path, space):
-    config = FitConfig({"width": 64, "depth": 2}, action_space=space, steps=600, batch_size=36, eval_split=0.0)
+def test_the_mlp_learns_each_space_from_the_same_table_and_gives_joint_targets(
+    table, sources, tmp_path, space
+):
+    config = FitConfig(
+        {"width": 64, "depth": 2}, action_space=space, steps=600, batch_size=36, eval_split=0.0
+    )
     path = Trainer(sources, config, tmp_path).fit()
     policy = LearnedPolicy.load(path)
     assert (policy.checkpoint.space, policy.checkpoint.origin.action_space) == (space, space)
     actions = policy.act(table[STATE], table["observation.environment_state"])
     wanted, states = table[ACTION].astype(np.float64), table[STATE].astype(np.float64)
-    reached, needed = poses("panda", actions) - poses("panda", wanted), poses("panda", wanted) - poses("panda", states)
+    reached, needed = (
+        poses("panda", actions) - poses("panda", wanted),
+        poses("panda", wanted) - poses("panda", states),
+    )
     assert np.abs(reached).mean() < 0.2 * np.abs(needed).mean()
 
 
@@ -154,13 +187,20 @@ def test_lerobots_own_code_carries_each_space(table, sources, tmp_path, space, s
     before, after = make_pre_post_processors(config, str(path))  # as lerobot-eval loads them
     states = torch.from_numpy(table[STATE][:5])
     before(
-        {STATE: states, "observation.environment_state": torch.from_numpy(table["observation.environment_state"][:5])}
+        {
+            STATE: states,
+            "observation.environment_state": torch.from_numpy(
+                table["observation.environment_state"][:5]
+            ),
+        }
     )
     found = Conversion(space, "panda")
     learnt = found.encode(table[ACTION], table[STATE])
     middle = after(torch.zeros(5, 8)).numpy()  # of the normalised targets, of whatever kind
     centre = learnt.mean(0) if settings is ACT else (learnt.max(0) + learnt.min(0)) / 2
-    np.testing.assert_allclose(middle, found.decode(np.tile(centre, (5, 1)), table[STATE][:5]), atol=5e-3)
+    np.testing.assert_allclose(
+        middle, found.decode(np.tile(centre, (5, 1)), table[STATE][:5]), atol=5e-3
+    )
     acted = policy.act(table[STATE][:2], table["observation.environment_state"][:2])
     assert acted.shape == (2, 8)
 
@@ -174,7 +214,9 @@ def test_every_action_of_a_plan_is_measured_from_its_own_frame(table, sources, t
     np.testing.assert_array_equal(batch[ACTION][1], targets[[10, 11, 11, 11]])  # the episode ends
 
 
-def test_a_run_in_another_space_goes_on_to_the_same_weights_and_not_in_lerobot_train(sources, tmp_path, weights):
+def test_a_run_in_another_space_goes_on_to_the_same_weights_and_not_in_lerobot_train(
+    sources, tmp_path, weights
+):
     more = {"observation": "state"}
     whole = trainer_of(sources, tmp_path / "whole", ACT, JOINT_DELTA, **more).fit()
 
@@ -191,11 +233,17 @@ def test_a_run_in_another_space_goes_on_to_the_same_weights_and_not_in_lerobot_t
 
 
 def test_a_checkpoint_goes_on_in_its_own_space_alone(table, sources, tmp_path):
-    path = Trainer(sources, FitConfig({"width": 8}, action_space=EE_DELTA, **SMALL), tmp_path / "ee").fit()
-    more = LearnedPolicy.load(trainer_of(sources, tmp_path / "more", {"path": str(path)}, None).fit())
+    path = Trainer(
+        sources, FitConfig({"width": 8}, action_space=EE_DELTA, **SMALL), tmp_path / "ee"
+    ).fit()
+    more = LearnedPolicy.load(
+        trainer_of(sources, tmp_path / "more", {"path": str(path)}, None).fit()
+    )
     assert (more.checkpoint.space, more.checkpoint.robot) == (EE_DELTA, "panda")
     assert np.isfinite(more.act(table[STATE], table["observation.environment_state"])).all()
-    with pytest.raises(MismatchError, match=r"checkpoint .* has ee_delta, this fit has joint_delta"):
+    with pytest.raises(
+        MismatchError, match=r"checkpoint .* has ee_delta, this fit has joint_delta"
+    ):
         trainer_of(sources, tmp_path / "other", {"path": str(path)}, JOINT_DELTA)
     with pytest.raises(ManipError, match="cannot be exported; train with joint_delta"):
         export_onnx(path)
@@ -203,7 +251,10 @@ def test_a_checkpoint_goes_on_in_its_own_space_alone(table, sources, tmp_path):
 
 def test_lerobots_own_training_has_no_kinematics(table, sources):
     [dataset] = sources
-    meta: Any = SimpleNamespace(features=JoinedDatasets(sources).features, root=dataset.root, stats={})  # as LeRobot's
+    # as LeRobot's
+    meta: Any = SimpleNamespace(
+        features=JoinedDatasets(sources).features, root=dataset.root, stats={}
+    )
     with pytest.raises(ManipError, match="train with manip-il train"):
         make_policy(make_policy_config("mlp", action_space=EE_DELTA), ds_meta=meta)
     policy: Any = make_policy(make_policy_config("mlp", action_space=JOINT_TARGET), ds_meta=meta)
@@ -219,7 +270,9 @@ def test_a_hand_moves_alike_whatever_units_its_joints_have(monkeypatch: pytest.M
     in_degrees = np.array([180 / np.pi] * len(panda.joints) + [1.0])
     with monkeypatch.context() as patch:
         patch.setattr(
-            action_spaces, "get_robot", lambda name: replace(panda, lerobot=LeRobotConfig("arm", names, (0.0, 1.0)))
+            action_spaces,
+            "get_robot",
+            lambda name: replace(panda, lerobot=LeRobotConfig("arm", names, (0.0, 1.0))),
         )
         found = plain.encode(actions * in_degrees, states * in_degrees)
         back = plain.decode(found, states * in_degrees)

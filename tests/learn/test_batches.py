@@ -1,4 +1,6 @@
-"""Rows in their order, and crops and colour jitter of pictures: draws are the generator's or the seed's alone."""
+"""Rows in their order, and crops and colour jitter of pictures: draws are the generator's or the
+seed's alone.
+"""
 
 import numpy as np
 import pytest
@@ -18,7 +20,8 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def test_floats_are_lerobots(pictures: Tensor) -> None:
-    assert torch.equal(to_float(pictures), (pictures / 255.0).type(torch.float32))  # as it decodes video
+    # as it decodes video
+    assert torch.equal(to_float(pictures), (pictures / 255.0).type(torch.float32))
     assert to_float(pictures).dtype == torch.float32
 
 
@@ -34,7 +37,10 @@ def test_the_same_draws_give_the_same_bytes(pictures: Tensor) -> None:
 def test_a_crop_is_the_picture_moved_with_its_border_repeated(pictures: Tensor) -> None:
     shift = 3
     crops = Augment(shift, 0, 0, 0)(pictures, generator())
-    found = [moves_of(crop, to_float(picture), shift) for crop, picture in zip(crops, pictures, strict=True)]
+    found = [
+        moves_of(crop, to_float(picture), shift)
+        for crop, picture in zip(crops, pictures, strict=True)
+    ]
     assert all(len(moves) == 1 for moves in found)
     assert len({moves[0] for moves in found}) > 1  # a draw a picture
 
@@ -43,7 +49,11 @@ def moves_of(crop: Tensor, picture: Tensor, shift: int) -> list[tuple[int, int]]
     padded = torch.nn.functional.pad(picture[None], (shift,) * 4, mode="replicate")[0]
     height, width = picture.shape[1:]
     places = [(y, x) for y in range(2 * shift + 1) for x in range(2 * shift + 1)]
-    return [(y, x) for y, x in places if torch.allclose(padded[:, y : y + height, x : x + width], crop, atol=1e-6)]
+    return [
+        (y, x)
+        for y, x in places
+        if torch.allclose(padded[:, y : y + height, x : x + width], crop, atol=1e-6)
+    ]
 
 
 def test_the_pictures_of_a_sample_change_together(pictures: Tensor) -> None:

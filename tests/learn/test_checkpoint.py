@@ -1,4 +1,6 @@
-"""A folder from anywhere: what it says is checked before anything of it is loaded, and nothing that it names runs."""
+"""A folder from anywhere: what it says is checked before anything of it is loaded, and nothing
+that it names runs.
+"""
 
 from __future__ import annotations
 
@@ -33,26 +35,47 @@ EVIL = {
 
 
 def test_what_a_policy_sees_gives_and_is_for_is_read_without_loading_it(pictured, tmp_path):
-    origin = Origin.of(pictured, {"mujoco": "3"}, {"steps": 2}, "both", {}, action_space="joint_target")
+    origin = Origin.of(
+        pictured, {"mujoco": "3"}, {"steps": 2}, "both", {}, action_space="joint_target"
+    )
     folder = write_checkpoint(tmp_path / "policy", "act", pictured, "both", origin=origin)
     (folder / "model.safetensors").write_bytes(b"")
     found = Checkpoint.open(folder)
-    assert (found.kind, found.observation, found.action, found.space) == ("act", "both", 4, "joint_target")
+    assert (found.kind, found.observation, found.action, found.space) == (
+        "act",
+        "both",
+        4,
+        "joint_target",
+    )
     assert found.numbers == {"observation.state": 4, "observation.environment_state": 6}
     assert found.pictures == {"front": (32, 48), "wrist": (32, 48)}
     assert found.origin == origin
     found.check_fits(pictured)
-    edit_config(folder, input_features={"observation.images.empty_camera_0": {"type": "VISUAL", "shape": [3, 48, 64]}})
+    edit_config(
+        folder,
+        input_features={
+            "observation.images.empty_camera_0": {"type": "VISUAL", "shape": [3, 48, 64]}
+        },
+    )
     assert Checkpoint.open(folder).pictures == {}  # LeRobot fills it in itself
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"numbers": {"observation.state": 5}}, r"observation\.state .*the policy has 5, arm/reach has 4"),
+        (
+            {"numbers": {"observation.state": 5}},
+            r"observation\.state .*the policy has 5, arm/reach has 4",
+        ),
         ({"action": 7}, r"action differs: the policy has 7, arm/reach has 4"),
-        ({"pictures": {"top": (32, 48)}}, r"images\.top .*the policy has \(32, 48\), arm/reach has None"),
-        ({"robot": "leg"}, r"robot of the inverse kinematics.*the policy has leg, arm/reach has arm"),
+        (
+            {"pictures": {"top": (32, 48)}},
+            r"images\.top .*the policy has \(32, 48\), arm/reach has None",
+        ),
+        (
+            {"robot": "leg"},
+            r"robot of the inverse kinematics.*the policy has leg, arm/reach has arm",
+        ),
     ],
 )
 def test_an_environment_that_lacks_an_input_is_refused_by_both_names(change, words, act, pictured):
@@ -60,7 +83,9 @@ def test_an_environment_that_lacks_an_input_is_refused_by_both_names(change, wor
         replace(Checkpoint.open(act), **change).check_fits(pictured)
 
 
-@pytest.mark.parametrize("change", [{"robot": "leg"}, {"fps": 50}, {"joint_names": ("a", "c", "b", "gripper")}])
+@pytest.mark.parametrize(
+    "change", [{"robot": "leg"}, {"fps": 50}, {"joint_names": ("a", "c", "b", "gripper")}]
+)
 def test_a_policy_for_something_else_is_refused_naming_both(change, act, spec):
     with pytest.raises(MismatchError) as error:
         Checkpoint.open(act).check_fits(replace(spec, **change))
@@ -69,8 +94,12 @@ def test_a_policy_for_something_else_is_refused_naming_both(change, act, spec):
     assert str(getattr(spec, name)) in str(error.value)
 
 
-@pytest.mark.parametrize("settings", [{"type": "mlp", "width": 8}, ACT, CNN], ids=lambda one: str(one["type"]))
-def test_a_checkpoint_acts_and_is_gone_on_from_where_its_dataset_is_not(settings, write, table, pictured, tmp_path):
+@pytest.mark.parametrize(
+    "settings", [{"type": "mlp", "width": 8}, ACT, CNN], ids=lambda one: str(one["type"])
+)
+def test_a_checkpoint_acts_and_is_gone_on_from_where_its_dataset_is_not(
+    settings, write, table, pictured, tmp_path
+):
     spec = replace(pictured, cameras=("front",))
     data = write(table, "gone", spec)
     path = Trainer(data, FitConfig(settings, steps=2, batch_size=8), tmp_path / "run").fit()
@@ -121,7 +150,9 @@ def ran(monkeypatch) -> list[tuple[Any, ...]]:
             return [[0]]
 
     monkeypatch.setattr(tokenizer_processor, "_transformers_available", True)
-    monkeypatch.setattr(tokenizer_processor, "require_package", lambda *_, **__: None, raising=False)
+    monkeypatch.setattr(
+        tokenizer_processor, "require_package", lambda *_, **__: None, raising=False
+    )
     for name in ("AutoProcessor", "AutoTokenizer"):
         monkeypatch.setattr(tokenizer_processor, name, Fake, raising=False)
     return calls
@@ -152,7 +183,8 @@ def test_a_worker_trusts_only_what_its_job_does(act, ran):
         list(pickle.loads(pickle.dumps(job)).run([0]))
     assert ran == []
     trusting = replace(job, driver=replace(job.driver, trust=True))
-    with pytest.raises(ManipError) as caught:  # sizes that do not belong together are found after all is allowed
+    # sizes that do not belong together are found after all is allowed
+    with pytest.raises(ManipError) as caught:
         list(pickle.loads(pickle.dumps(trusting)).run([0]))
     assert "--trust" not in str(caught.value)
 
@@ -160,11 +192,18 @@ def test_a_worker_trusts_only_what_its_job_does(act, ran):
 @pytest.mark.parametrize(
     ("step", "words"),
     [
-        ({"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil/x"}}, "--trust=true"),
+        (
+            {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil/x"}},
+            "--trust=true",
+        ),
         ({"registry_name": "groot_n1_7_pack_inputs_v1", "config": {}}, "--trust=true"),
         ({"class": "subprocess.Popen", "config": {"args": "true"}}, r"subprocess\.Popen"),
         (
-            {"registry_name": "normalizer_processor", "config": {}, "state_file": "missing.safetensors"},
+            {
+                "registry_name": "normalizer_processor",
+                "config": {},
+                "state_file": "missing.safetensors",
+            },
             "cannot load it",
         ),
     ],
@@ -180,7 +219,9 @@ def test_a_processor_loads_registered_steps_alone(step, words, act):
 @pytest.mark.parametrize("kind", policy_types())
 def test_every_policy_of_lerobots_is_plain_or_needs_trust(kind):
     options = [field.name for field in dataclasses.fields(policy_class(kind))]
-    assert kind not in PLAIN or not any(name.endswith(("model_name", "tokenizer_name")) for name in options)
+    assert kind not in PLAIN or not any(
+        name.endswith(("model_name", "tokenizer_name")) for name in options
+    )
     settings = {"type": kind}
     if kind in PLAIN:
         require_trust(settings, "x", trust=False)
@@ -194,9 +235,14 @@ def test_an_encoder_that_a_checkpoint_names_is_made_only_where_it_is_trusted(act
     edit_config(act, type="gaussian_actor", vision_encoder_name="evil/encoder")
     for settings, source in (
         ({"path": str(act)}, r"--policy\.path"),
-        ({"type": "gaussian_actor", "vision_encoder_name": "evil/encoder"}, r"--policy\.type=gaussian_actor"),
+        (
+            {"type": "gaussian_actor", "vision_encoder_name": "evil/encoder"},
+            r"--policy\.type=gaussian_actor",
+        ),
     ):
         with pytest.raises(ManipError, match=rf"{source}.*evil/encoder.*--trust=true"):
             policy_config(FitConfig(settings))
-    allowed = FitConfig({"type": "gaussian_actor", "vision_encoder_name": "evil/encoder"}, trust=True)
+    allowed = FitConfig(
+        {"type": "gaussian_actor", "vision_encoder_name": "evil/encoder"}, trust=True
+    )
     assert policy_config(allowed).type == "gaussian_actor"

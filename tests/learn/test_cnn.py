@@ -1,4 +1,6 @@
-"""The cnn policy: keypoints that point, LeRobot's way in and out, and labels and truth that only training sees."""
+"""The cnn policy: keypoints that point, LeRobot's way in and out, and labels and truth that only
+training sees.
+"""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,7 +11,12 @@ import pytest
 import torch
 from lerobot.configs import NormalizationMode
 from lerobot.optim.optimizers import save_optimizer_state
-from lerobot.policies.factory import get_policy_class, make_policy, make_policy_config, make_pre_post_processors
+from lerobot.policies.factory import (
+    get_policy_class,
+    make_policy,
+    make_policy_config,
+    make_pre_post_processors,
+)
 
 from manip_il.data.schema import features
 from manip_il.errors import MismatchError, UnknownName, UsageError
@@ -39,7 +46,10 @@ def table(gapped):
 
 @pytest.fixture
 def meta(dataset, spec):
-    """What LeRobot knows of a dataset with two cameras, a tenth of whose labels are invalid; it has no videos."""
+    """What LeRobot knows of a dataset with two cameras, a tenth of whose labels are invalid.
+
+    It has no videos.
+    """
     pictured = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE))
     return SimpleNamespace(features=features(pictured), root=dataset[0].root, stats={})
 
@@ -47,7 +57,9 @@ def meta(dataset, spec):
 def new_policy(meta, observation: str = "images", **options) -> CNNPolicy:
     """As LeRobot makes it from a dataset."""
     config = make_policy_config("cnn", **SMALL | options)
-    config.input_features, config.output_features = policy_features(meta.features, INPUTS[observation])
+    config.input_features, config.output_features = policy_features(
+        meta.features, INPUTS[observation]
+    )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         policy = make_policy(config, ds_meta=meta)
@@ -69,12 +81,16 @@ def make_batch(table, rows: int = 20, seed: int = 0) -> dict[str, torch.Tensor]:
 
 
 def rows_of(batch: dict[str, torch.Tensor]) -> list[dict[str, torch.Tensor]]:
-    return [{key: value[i : i + 1] for key, value in batch.items()} for i in range(len(batch["index"]))]
+    return [
+        {key: value[i : i + 1] for key, value in batch.items()} for i in range(len(batch["index"]))
+    ]
 
 
 def test_larger_pictures_are_averaged(meta, table):
     policy, batch = new_policy(meta).eval(), make_batch(table, rows=3)
-    larger = batch | {key: batch[key].repeat_interleave(3, 2).repeat_interleave(3, 3) for key in PICTURES}
+    larger = batch | {
+        key: batch[key].repeat_interleave(3, 2).repeat_interleave(3, 3) for key in PICTURES
+    }
     assert torch.allclose(policy.select_action(larger), policy.select_action(batch), atol=1e-5)
 
 
@@ -108,7 +124,8 @@ def test_lerobot_makes_it_from_a_dataset_without_a_look_at_the_truth(meta):
     assert list(policy.config.input_features or {}) == [
         "observation.state", "observation.images.front", "observation.images.wrist"
     ]  # fmt: skip
-    assert policy.model.input_mean.shape == (4 + 2 * 3 * 4 + 6,)  # joints, keypoints, and what is read off
+    # joints, keypoints, and what is read off
+    assert policy.model.input_mean.shape == (4 + 2 * 3 * 4 + 6,)
     assert set(CNNConfig(**SMALL).normalization_mapping.values()) == {NormalizationMode.IDENTITY}
 
 
@@ -145,7 +162,9 @@ def test_saved_and_loaded_by_lerobot_it_acts_bit_equal(meta, table, tmp_path):
     expected = policy.eval().select_action(batch)
     inputs = {key: batch[key] for key in again.config.input_features or {}}
     for row in range(3):  # unbatched, as a robot gives them
-        action = after(again.select_action(before({key: value[row] for key, value in inputs.items()})))
+        action = after(
+            again.select_action(before({key: value[row] for key, value in inputs.items()}))
+        )
         assert torch.equal(action, expected[row : row + 1])
 
 
@@ -153,7 +172,9 @@ def test_a_row_does_not_depend_on_the_others_nor_on_half_precision(meta, table):
     policy, batch = new_policy(meta).eval(), make_batch(table)
     together = policy.select_action(batch)
     for rows in ([0], [19, 3], list(range(5, 20))):
-        assert torch.equal(policy.select_action({key: value[rows] for key, value in batch.items()}), together[rows])
+        assert torch.equal(
+            policy.select_action({key: value[rows] for key, value in batch.items()}), together[rows]
+        )
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(policy.select_action(batch), together)
     assert policy.select_action({key: value[:0] for key, value in batch.items()}).shape == (0, 4)
@@ -180,8 +201,14 @@ def test_the_truth_is_read_off_joints_and_keypoints_and_learnt_while_training_on
 def test_offsets_that_are_read_off_or_given_enter_at_several_scales_too(meta, table, tmp_path):
     columns = dict(meta.features)
     names = ["a_from_b.x", "e1", "e2", "a_from_b.z", "e4", "e5"]
-    columns["observation.environment_state"] = columns["observation.environment_state"] | {"names": names}
-    named, batch, scales = SimpleNamespace(features=columns, root=meta.root, stats={}), make_batch(table), (0.003, 0.03)
+    columns["observation.environment_state"] = columns["observation.environment_state"] | {
+        "names": names
+    }
+    named, batch, scales = (
+        SimpleNamespace(features=columns, root=meta.root, stats={}),
+        make_batch(table),
+        (0.003, 0.03),
+    )
     truth = torch.from_numpy(table["observation.environment_state"])
     for observation, seen in (("images", 4 + 24), ("both", 4 + 6 + 24)):
         policy = new_policy(named, observation, scales=scales, width=64)
@@ -212,7 +239,8 @@ def test_with_states_actions_are_learnt_from_true_ones_with_noise_and_follow_the
 ):
     policy, batch = new_policy(meta, states=str(meta.root), width=64), make_batch(table)
     optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=3e-3)
-    blank = batch | {key: torch.zeros_like(batch[key]) for key in PICTURES}  # the label does not show in these
+    # the label does not show in these
+    blank = batch | {key: torch.zeros_like(batch[key]) for key in PICTURES}
     for _ in range(100):
         optimizer.zero_grad()
         policy.forward(blank)[0].backward()
@@ -224,9 +252,14 @@ def test_with_states_actions_are_learnt_from_true_ones_with_noise_and_follow_the
     assert error < 0.5 * (batch["action"] - batch["observation.state"])[valid, :-1].std(0).mean()
     assert (policy.error > 0).any()
     expected = policy.eval().select_action(batch)
-    assert torch.equal(expected, policy.model.act(torch.cat([policy.network_inputs(row) for row in rows_of(batch)])))
+    assert torch.equal(
+        expected,
+        policy.model.act(torch.cat([policy.network_inputs(row) for row in rows_of(batch)])),
+    )
     policy.save_pretrained(tmp_path)
-    assert torch.equal(CNNPolicy.from_pretrained(tmp_path, strict=True).eval().select_action(batch), expected)
+    assert torch.equal(
+        CNNPolicy.from_pretrained(tmp_path, strict=True).eval().select_action(batch), expected
+    )
     with pytest.raises(UsageError, match=r"policy\.states needs"):
         new_policy(meta, states=str(meta.root), aux_weight=0.0)
     with pytest.raises(UsageError, match=r"policy\.states cannot be combined with ee_delta"):
@@ -234,8 +267,12 @@ def test_with_states_actions_are_learnt_from_true_ones_with_noise_and_follow_the
     config: Any = policy.config
     wide = write_table({**table, "action": 3 * table["action"]}, tmp_path / "wide", spec)
     config.pretrained_path, config.states = tmp_path, str(wide[0].root)
-    again: Any = build_policy(config, SimpleNamespace(features=meta.features, root=wide[0].root, stats={}))
-    assert (again.model.target_high > policy.model.target_high).any(), "it acts within the range of the new data"
+    again: Any = build_policy(
+        config, SimpleNamespace(features=meta.features, root=wide[0].root, stats={})
+    )
+    assert (again.model.target_high > policy.model.target_high).any(), (
+        "it acts within the range of the new data"
+    )
     other = write_table(table, tmp_path / "other", replace(spec, task="lift"))
     with pytest.raises(MismatchError, match="task differs"):
         new_policy(meta, states=str(other[0].root))

@@ -19,7 +19,10 @@ POLICIES = {
     "act": ("act", {}),
     "act, ensembled": ("act", {"temporal_ensemble_coeff": 0.01, "n_action_steps": 1}),
     "diffusion": ("diffusion", {}),
-    "diffusion, few steps": ("diffusion", {"noise_scheduler_type": "DDIM", "num_inference_steps": 3}),
+    "diffusion, few steps": (
+        "diffusion",
+        {"noise_scheduler_type": "DDIM", "num_inference_steps": 3},
+    ),
 }
 
 
@@ -34,16 +37,23 @@ def actions(policy: LearnedPolicy, starts: dict[int, int]) -> dict[int, np.ndarr
     done: dict[int, list[np.ndarray]] = {episode: [] for episode in starts}
     for step in range(STEPS + max(starts.values())):
         running = [episode for episode, start in starts.items() if start <= step < start + STEPS]
-        rows = [[column[step - starts[episode]] for column in observations(STEPS, episode)] for episode in running]
+        rows = [
+            [column[step - starts[episode]] for column in observations(STEPS, episode)]
+            for episode in running
+        ]
         states, environments = (np.array(column) for column in zip(*rows, strict=True))
-        for episode, action in zip(running, policy.act(states, environments, None, running), strict=True):
+        for episode, action in zip(
+            running, policy.act(states, environments, None, running), strict=True
+        ):
             done[episode].append(action)
     return {episode: np.array(rows) for episode, rows in done.items()}
 
 
 def lerobots_own(checkpoint: Path, episode: int) -> np.ndarray:
     """LeRobot's loop over one episode, its noise drawn anew from episode and step."""
-    policy = get_policy_class(json.loads((checkpoint / "config.json").read_text())["type"]).from_pretrained(checkpoint)
+    policy = get_policy_class(
+        json.loads((checkpoint / "config.json").read_text())["type"]
+    ).from_pretrained(checkpoint)
     before, after = make_pre_post_processors(policy.config, str(checkpoint))
     policy.reset()
     done = []
@@ -51,7 +61,9 @@ def lerobots_own(checkpoint: Path, episode: int) -> np.ndarray:
         batch = {"observation.state": torch.from_numpy(state[None]), "task": ["reach"]}
         batch["observation.environment_state"] = torch.from_numpy(environment[None])
         with torch.random.fork_rng(devices=[]), torch.inference_mode():
-            torch.manual_seed(int(np.random.SeedSequence([episode, step]).generate_state(1, np.uint64)[0]))
+            torch.manual_seed(
+                int(np.random.SeedSequence([episode, step]).generate_state(1, np.uint64)[0])
+            )
             done.append(after(policy.select_action(before(batch))).numpy()[0])
     return np.array(done, np.float64)
 
@@ -110,7 +122,9 @@ def test_the_task_in_words_reaches_the_policy(act, monkeypatch):
 
 def test_pictures_must_be_those_of_the_checkpoint(pictured, tmp_path):
     origin = Origin.of(pictured, observation="images", look={})
-    policy = LearnedPolicy.load(write_checkpoint(tmp_path / "policy", "act", pictured, "images", origin=origin))
+    policy = LearnedPolicy.load(
+        write_checkpoint(tmp_path / "policy", "act", pictured, "images", origin=origin)
+    )
     assert policy.checkpoint.observation == "images"
     assert (policy.cameras, policy.checkpoint.origin) == (("front", "wrist"), origin)
     states, environments = (column[:2] for column in observations(STEPS, 0))

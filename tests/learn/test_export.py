@@ -1,4 +1,6 @@
-"""Exported policies act as the checkpoint does, for any number of rows, and say what their numbers mean."""
+"""Exported policies act as the checkpoint does, for any number of rows, and say what their
+numbers mean.
+"""
 
 import json
 from dataclasses import replace
@@ -49,19 +51,30 @@ def mlp(request, tmp_path) -> Path:
     return Trainer((Dataset.open(SAMPLE),), config, tmp_path / "run").fit()
 
 
-def write_cnn(folder: Path, spec: EnvironmentSpec, observation: str = "images", **options: Any) -> Path:
+def write_cnn(
+    folder: Path, spec: EnvironmentSpec, observation: str = "images", **options: Any
+) -> Path:
     pictured = replace(spec, cameras=("wrist", "front"), image_size=SIDES)
     return write_checkpoint(
-        folder, "cnn", pictured, observation, origin=Origin.of(pictured, observation=observation), **options
+        folder,
+        "cnn",
+        pictured,
+        observation,
+        origin=Origin.of(pictured, observation=observation),
+        **options,
     )
 
 
 def drawn(spec: EnvironmentSpec, rows: int, pictures: bool = False) -> Observation:
-    """Noise, and beside it in every second picture a small bright thing on black, which keypoints are sharp on."""
+    """Noise, and beside it in every second picture a small bright thing on black, which
+    keypoints are sharp on.
+    """
     rng = np.random.default_rng(1)
     observation = {
         STATE: rng.normal(size=(rows, len(spec.joint_names))).astype(np.float32),
-        ENVIRONMENT_STATE: rng.normal(size=(rows, len(spec.environment_state_names))).astype(np.float32),
+        ENVIRONMENT_STATE: (
+            rng.normal(size=(rows, len(spec.environment_state_names))).astype(np.float32)
+        ),
     }
     for camera in ("front", "wrist") if pictures else ():
         picture = rng.integers(256, size=(rows, *SIDES, 3), dtype=np.uint8)
@@ -75,7 +88,9 @@ def drawn(spec: EnvironmentSpec, rows: int, pictures: bool = False) -> Observati
 
 def lerobot_actions(checkpoint: Path, observation: Observation) -> NDArray[np.float32]:
     """What `select_action` and LeRobot's processors make of observations."""
-    policy = get_policy_class(json.loads((checkpoint / "config.json").read_text())["type"]).from_pretrained(checkpoint)
+    policy = get_policy_class(
+        json.loads((checkpoint / "config.json").read_text())["type"]
+    ).from_pretrained(checkpoint)
     before, after = make_pre_post_processors(policy.config, pretrained_path=str(checkpoint))
     batch = {key: torch.from_numpy(values) for key, values in observation.items()}
     for key in batch:
@@ -107,7 +122,9 @@ def test_an_mlp_acts_as_its_checkpoint_on_real_and_random_observations(mlp):
 @pytest.mark.parametrize("observation", ["images", "both"])
 def test_a_cnn_acts_as_its_checkpoint_whatever_the_number_of_pictures(observation, spec, tmp_path):
     size = 6 if observation == "images" else 0  # what is read off the pictures
-    checkpoint = write_cnn(tmp_path / "cnn", spec, observation, loss="mixture", privileged_size=size)
+    checkpoint = write_cnn(
+        tmp_path / "cnn", spec, observation, loss="mixture", privileged_size=size
+    )
     check_equal(checkpoint, [drawn(spec, 1, pictures=True), drawn(spec, 21, pictures=True)])
 
 
@@ -116,7 +133,9 @@ def metadata_in(data: bytes) -> dict[str, Any]:
     told |= {key: json.loads(told[key]) for key in ("inputs", "outputs", "control_rate_hz")}
     session = onnxruntime.InferenceSession(data)
     for declared, of in ((session.get_inputs(), "inputs"), (session.get_outputs(), "outputs")):
-        assert [(one.name, one.shape) for one in declared] == [(one["name"], one["shape"]) for one in told[of]]
+        assert [(one.name, one.shape) for one in declared] == [
+            (one["name"], one["shape"]) for one in told[of]
+        ]
     return told
 
 
@@ -134,7 +153,12 @@ def test_the_metadata_name_every_number_with_its_unit(tmp_path):
         "policy_sha256": policy_sha256(checkpoint),
     }
     state, around, front, wrist = told["inputs"]
-    joints = {"dtype": "float32", "shape": ["batch", 8], "names": list(spec.joint_names), "units": ["rad"] * 7 + ["m"]}
+    joints = {
+        "dtype": "float32",
+        "shape": ["batch", 8],
+        "names": list(spec.joint_names),
+        "units": ["rad"] * 7 + ["m"],
+    }
     assert state == {"name": STATE} | joints
     assert told["outputs"] == [{"name": "action"} | joints]
     units = dict(zip(around["names"], around["units"], strict=True))
@@ -169,5 +193,7 @@ def test_a_file_that_acts_otherwise_is_refused(spec, tmp_path, monkeypatch):
     save_file(weights, other / "model.safetensors")
     policy, make = LearnedPolicy.load(other), export.PolicyFunction
     monkeypatch.setattr(export, "PolicyFunction", lambda _: make(policy))
-    with pytest.raises(ManipError, match=r"differ by up to 2e-05 from the checkpoint's; expected at most 1e-05"):
+    with pytest.raises(
+        ManipError, match=r"differ by up to 2e-05 from the checkpoint's; expected at most 1e-05"
+    ):
         export_onnx(checkpoint)

@@ -1,4 +1,6 @@
-"""Options of LeRobot's, by its names: of policies, optimisers and schedules, and what a policy sees."""
+"""Options of LeRobot's, by its names: of policies, optimisers and schedules, and what a policy
+sees.
+"""
 
 import pytest
 from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
@@ -26,7 +28,9 @@ def test_every_policy_of_lerobot_and_ours_is_known() -> None:
 
 
 def test_options_have_lerobots_names_and_types() -> None:
-    config = configured({"type": "diffusion", "down_dims": [32, 64], "horizon": "16", "device": "cpu"})
+    config = configured(
+        {"type": "diffusion", "down_dims": [32, 64], "horizon": "16", "device": "cpu"}
+    )
     assert isinstance(config, DiffusionConfig)
     assert (config.down_dims, config.horizon) == ((32, 64), 16)
     assert config.push_to_hub is False  # LeRobot's default is to upload
@@ -38,7 +42,11 @@ def test_optimisers_and_schedules_by_their_type_for_every_policy() -> None:
     assert adamw.lr == 5e-4
     with pytest.raises(UnknownName, match=r"scheduler\.type"):
         choice(LRSchedulerConfig, {"type": "cosine"}, "scheduler")
-    for more, rate in (({}, 2e-3), ({"lr": 1e-4}, 1e-4), ({"optimizer": {"type": "sgd", "lr": 0.1}}, 0.1)):
+    for more, rate in (
+        ({}, 2e-3),
+        ({"lr": 1e-4}, 1e-4),
+        ({"optimizer": {"type": "sgd", "lr": 0.1}}, 0.1),
+    ):
         pipeline, _ = lerobot_options(FitConfig(**more))
         assert pipeline.optimizer is not None
         assert pipeline.optimizer.lr == rate
@@ -53,4 +61,7 @@ def test_a_checkpoint_gives_its_options_and_they_can_be_changed(spec, tmp_path) 
         assert config.pretrained_path == path
     started = FitConfig({"path": str(path)})
     assert (started.kind, started.observes, started.total_steps) == ("act", "state", 100_000)
-    assert FitConfig({"path": str(write_checkpoint(tmp_path / "mlp", "mlp", spec))}).total_steps == 3_000
+    assert (
+        FitConfig({"path": str(write_checkpoint(tmp_path / "mlp", "mlp", spec))}).total_steps
+        == 3_000
+    )

@@ -26,7 +26,9 @@ def head_for(loss: str, n: int = N, sigma: float = 1.0) -> Head:
     return make_head(loss, n, components=4, bins=11, sigma=sigma)
 
 
-def fitted(head: Head, targets: torch.Tensor, steps: int = 600) -> tuple[torch.Tensor, float, float]:
+def fitted(
+    head: Head, targets: torch.Tensor, steps: int = 600
+) -> tuple[torch.Tensor, float, float]:
     """The best constant params for `targets` (B, n), and the loss before and after."""
     start = torch.randn(head.size, generator=torch.Generator().manual_seed(1))
     params = start.clone().requires_grad_()
@@ -52,7 +54,10 @@ def test_fitting_reduces_the_loss_and_acts_near_a_single_target(loss, generator)
 
 
 def torchs(head: Head, params: torch.Tensor) -> td.Distribution:
-    """Torch's distribution of the same parameters; a categorical one is over the numbers of the bins."""
+    """Torch's distribution of the same parameters.
+
+    A categorical one is over the numbers of the bins.
+    """
     if isinstance(head, GaussianHead):
         return td.Independent(td.Normal(params, floored_log_std(head.raw_log_std).exp()), 1)
     if isinstance(head, MixtureHead):
@@ -68,7 +73,10 @@ def test_the_loss_is_torchs_negative_log_likelihood_with_a_gradient(loss, genera
     head = head_for(loss, sigma=0.0)  # all of a target at a bin's centre is in that bin
     if isinstance(head, GaussianHead):
         torch.nn.init.normal_(head.raw_log_std, generator=generator)
-    params, target = 3 * torch.randn((5, head.size), generator=generator), torch.randn((5, N), generator=generator)
+    params, target = (
+        3 * torch.randn((5, head.size), generator=generator),
+        torch.randn((5, N), generator=generator),
+    )
     bins = torch.tensor([0, 5, 10]).expand(5, N)
     ours, theirs = (bins / 5.0 - 1.0, bins) if loss == "categorical" else (target, target)
     losses = head.nll(params.requires_grad_(), ours)
@@ -90,15 +98,21 @@ def test_a_smeared_target_sums_to_one_and_its_expectation_is_the_target(sigma: f
     torch.testing.assert_close(shares.sum(-1), torch.ones(41, 1).double())
     centres = (torch.arange(head.total) - head.pad) * 0.1 - 1
     expected, width = (shares * centres).sum(-1), 0.1
-    # up to the wave of bins narrower than the Gaussian resolves, and to what lies beyond 3 deviations
-    torch.testing.assert_close(expected, TARGETS.double(), atol=width * (0.06 if sigma < 0.5 else 0.02), rtol=0)
+    # up to the wave of bins narrower than the Gaussian resolves, and to what lies beyond 3
+    # deviations
+    torch.testing.assert_close(
+        expected, TARGETS.double(), atol=width * (0.06 if sigma < 0.5 else 0.02), rtol=0
+    )
     spread = (shares * (centres - expected.unsqueeze(-1)).square()).sum(-1).sqrt() / width
     if sigma >= 0.75:
-        torch.testing.assert_close(spread, torch.full_like(spread, (sigma**2 + 1 / 12) ** 0.5), rtol=0.03, atol=0)
+        torch.testing.assert_close(
+            spread, torch.full_like(spread, (sigma**2 + 1 / 12) ** 0.5), rtol=0.03, atol=0
+        )
 
 
 @pytest.mark.parametrize(
-    ("loss", "on_a_mode"), [("mse", False), ("gaussian", False), ("mixture", True), ("categorical", True)]
+    ("loss", "on_a_mode"),
+    [("mse", False), ("gaussian", False), ("mixture", True), ("categorical", True)],
 )
 def test_two_ways_are_kept_apart_by_mixture_and_categorical_alone(loss, on_a_mode, generator):
     signs = torch.where(torch.rand((256, 1), generator=generator) < 0.6, 1.0, -1.0)

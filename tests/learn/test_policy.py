@@ -40,7 +40,14 @@ def test_a_row_does_not_depend_on_the_others(loss, count, dataset, tmp_path):
     inputs = torch.from_numpy(np.concatenate(observations(130), axis=1))
     with threads(count):
         together = policy.model.act(inputs)
-        for rows in ([0], [77], [129, 3], list(range(64)), list(range(129, 40, -1)), list(range(5, 130))):
+        for rows in (
+            [0],
+            [77],
+            [129, 3],
+            list(range(64)),
+            list(range(129, 40, -1)),
+            list(range(5, 130)),
+        ):
             assert torch.equal(policy.model.act(inputs[rows]), together[rows])
 
 
@@ -54,7 +61,9 @@ def test_acting_is_the_same_through_lerobots_processors(checkpoint):
             "observation.environment_state": torch.from_numpy(environments[row]),
         }
         action = after(policy.select_action(before(batch)))
-        fast = LearnedPolicy.load(checkpoint).act(states[row : row + 1], environments[row : row + 1])
+        fast = LearnedPolicy.load(checkpoint).act(
+            states[row : row + 1], environments[row : row + 1]
+        )
         assert fast.dtype == np.float64
         assert np.array_equal(action.numpy().astype(np.float64), fast)
 
@@ -64,7 +73,10 @@ def test_off_the_data_an_arm_target_stays_as_near_as_in_the_data(checkpoint, tab
     actions = LearnedPolicy.load(checkpoint).act(states * 1e3, environments * 1e6)
     relative = table["action"][:, :-1] - table["observation.state"][:, :-1]
     scale = np.abs(states).max() * 1e3
-    assert np.abs(actions[:, :-1] - states[:, :-1] * 1e3).max() <= np.abs(relative).max() + 1e-6 * scale
+    assert (
+        np.abs(actions[:, :-1] - states[:, :-1] * 1e3).max()
+        <= np.abs(relative).max() + 1e-6 * scale
+    )
 
 
 def test_pictures_go_in_as_lerobot_feeds_them():
@@ -75,7 +87,9 @@ def test_pictures_go_in_as_lerobot_feeds_them():
 
     inner = Seen()
     numbers, pictures = {"observation.state": 4}, {"front": (5, 6)}
-    policy = LearnedPolicy(inner, Checkpoint(Path("x"), {"type": "act"}, numbers, pictures, 4, "", "", (), None, {}))
+    policy = LearnedPolicy(
+        inner, Checkpoint(Path("x"), {"type": "act"}, numbers, pictures, 4, "", "", (), None, {})
+    )
     picture = np.arange(2 * 5 * 6 * 3, dtype=np.uint8).reshape(2, 5, 6, 3)
     states, environments = observations(2)
     policy.act(states, environments, {"front": picture, "wrist": picture}, [40, 30])
@@ -92,7 +106,9 @@ def test_offsets_are_seen_at_several_scales_and_nothing_else_is(write, table, sp
     names = ("ee.x", "goal_from_object.x", "goal_from_object.y", "e3", "e4", "e5")
     data = write(table, spec=replace(spec, environment_state_names=names))
     path = Trainer(
-        data, FitConfig({"scales": [0.003, 0.03], "width": 16}, steps=3, batch_size=32), tmp_path / "run"
+        data,
+        FitConfig({"scales": [0.003, 0.03], "width": 16}, steps=3, batch_size=32),
+        tmp_path / "run",
     ).fit()
     policy, states, environments = LearnedPolicy.load(path), *observations(70)
     network: Any = policy.module
@@ -101,8 +117,14 @@ def test_offsets_are_seen_at_several_scales_and_nothing_else_is(write, table, sp
     assert torch.equal(network.expanded(raw)[:, 12:], torch.tanh(raw[:, [5, 6]] / 0.03))
     actions = policy.act(states, environments)
     assert np.array_equal(policy.act(states[7:9], environments[7:9]), actions[7:9])
-    assert np.array_equal(MLPPolicy.from_pretrained(path).model.act(raw).numpy().astype(np.float64), actions)
-    again = Trainer(data, FitConfig({"path": str(path)}, steps=1, lr=1e-12, batch_size=32), tmp_path / "again").fit()
-    np.testing.assert_allclose(LearnedPolicy.load(again).act(states, environments), actions, atol=2e-5)
+    assert np.array_equal(
+        MLPPolicy.from_pretrained(path).model.act(raw).numpy().astype(np.float64), actions
+    )
+    again = Trainer(
+        data, FitConfig({"path": str(path)}, steps=1, lr=1e-12, batch_size=32), tmp_path / "again"
+    ).fit()
+    np.testing.assert_allclose(
+        LearnedPolicy.load(again).act(states, environments), actions, atol=2e-5
+    )
     with pytest.raises(UsageError, match="scales needs offsets"):
         Trainer(write(table, "other"), FitConfig({"scales": [0.003]}), tmp_path / "other_run").fit()

@@ -25,7 +25,10 @@ from .tiny_policies import ACT, DIFFUSION
 EPISODES = np.repeat([0, 1, 2], [5, 2, 4])
 
 
-@given(st.lists(st.integers(1, 6), min_size=1, max_size=5), st.lists(st.integers(-4, 4), min_size=1, max_size=6))
+@given(
+    st.lists(st.integers(1, 6), min_size=1, max_size=5),
+    st.lists(st.integers(-4, 4), min_size=1, max_size=6),
+)
 def test_a_window_never_leaves_its_episode(lengths, deltas) -> None:
     episodes = np.repeat(np.arange(len(lengths)), lengths)
     samples = np.arange(len(episodes))
@@ -41,12 +44,15 @@ def test_a_window_never_leaves_its_episode(lengths, deltas) -> None:
 @pytest.mark.parametrize(
     ("deltas", "invalid", "drop_last", "usable"),
     [
-        ({"action": np.arange(3)}, [3], 0, [0, 4, 5, 6, 7, 8, 9, 10]),  # 1, 2 and 3 would learn from frame 3
+        # 1, 2 and 3 would learn from frame 3
+        ({"action": np.arange(3)}, [3], 0, [0, 4, 5, 6, 7, 8, 9, 10]),
         ({}, [], 1, [0, 1, 2, 3, 5, 7, 8, 9]),
     ],
     ids=["unsound label", "last frames"],
 )
-def test_samples_with_an_unsound_label_and_last_frames_are_left_out(deltas, invalid, drop_last, usable) -> None:
+def test_samples_with_an_unsound_label_and_last_frames_are_left_out(
+    deltas, invalid, drop_last, usable
+) -> None:
     valid = ~np.isin(np.arange(11), invalid)
     assert Windows(EPISODES, deltas).usable(valid, drop_last).tolist() == usable
 
@@ -55,7 +61,9 @@ def test_the_windows_are_those_that_the_policy_asks_for() -> None:
     columns = ["observation.state", "action"]
     act = windows_of(ACTConfig(chunk_size=4, n_action_steps=4, device="cpu"), columns, EPISODES)
     assert {key: value.tolist() for key, value in act.deltas.items()} == {"action": [0, 1, 2, 3]}
-    diffusion = windows_of(DiffusionConfig(n_obs_steps=2, horizon=8, device="cpu"), columns, EPISODES)
+    diffusion = windows_of(
+        DiffusionConfig(n_obs_steps=2, horizon=8, device="cpu"), columns, EPISODES
+    )
     assert diffusion.deltas["observation.state"].tolist() == [-1, 0]
     assert diffusion.deltas["action"].tolist() == list(range(-1, 7))
 
@@ -65,13 +73,22 @@ def test_the_windows_are_those_that_the_policy_asks_for() -> None:
     [(ACT, "state"), (DIFFUSION, "state"), (ACT, "images"), (ACT, "both")],
     ids=lambda value: str(value["type"] if isinstance(value, dict) else value),
 )
-def test_a_batch_is_that_of_lerobots_loader(settings, observation, write, table, pictured, tmp_path):
+def test_a_batch_is_that_of_lerobots_loader(
+    settings, observation, write, table, pictured, tmp_path
+):
     sources = write(table, spec=pictured)
-    config = FitConfig({**settings, "pretrained_backbone_weights": None}, observation=observation, batch_size=8)
+    config = FitConfig(
+        {**settings, "pretrained_backbone_weights": None}, observation=observation, batch_size=8
+    )
     samples = Trainer(sources, config, tmp_path / "run").data
     meta = JoinedDatasets(sources)
-    ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in samples.windows.deltas.items()}
-    lerobots: Any = LeRobotDataset(meta.repo_id, root=sources[0].root, delta_timestamps=ahead or None)
+    ahead = {
+        key: [delta / meta.fps for delta in deltas.tolist()]
+        for key, deltas in samples.windows.deltas.items()
+    }
+    lerobots: Any = LeRobotDataset(
+        meta.repo_id, root=sources[0].root, delta_timestamps=ahead or None
+    )
     for rows in (np.array([0, 3, 20, meta.total_frames - 1]), np.array([7])):
         theirs = torch.utils.data.default_collate([lerobots[int(row)] for row in rows])
         for key, value in samples.batch(rows).items():
@@ -96,7 +113,10 @@ def test_tasks_of_several_datasets_are_numbered_together(spec, tmp_path):
 def test_unlabelled_frames_count_in_no_dataset_that_says_so(spec, tmp_path):
     table, other = make_table(), make_table()
     table["label_valid"][:100] = 0
-    sources = [*write_table(table, tmp_path / "half", spec), *write_table(other, tmp_path / "whole", spec)]
+    sources = [
+        *write_table(table, tmp_path / "half", spec),
+        *write_table(other, tmp_path / "whole", spec),
+    ]
     info = tmp_path / "whole" / "meta" / "info.json"
     told = json.loads(info.read_text())
     del told["features"]["label_valid"]
@@ -110,6 +130,10 @@ def test_an_environment_state_of_one_number_is_a_vector(spec, tmp_path):
     one = replace(spec, environment_state_names=("e0",))
     table = make_table()
     table["observation.environment_state"] = table["observation.environment_state"][:, :1]
-    trainer = Trainer(write_table(table, tmp_path / "data", one), FitConfig(steps=2, batch_size=8), tmp_path / "run")
+    trainer = Trainer(
+        write_table(table, tmp_path / "data", one),
+        FitConfig(steps=2, batch_size=8),
+        tmp_path / "run",
+    )
     assert trainer.data.columns["observation.environment_state"].shape == (240, 1)
     trainer.fit()

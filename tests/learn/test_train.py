@@ -1,4 +1,7 @@
-"""Training is a function of data, options and seed, for every kind of policy; it refuses what it cannot learn from."""
+"""Training is a function of data, options and seed, for every kind of policy.
+
+It refuses what it cannot learn from.
+"""
 
 import json
 import math
@@ -31,7 +34,13 @@ MLP = {"type": "mlp", "width": 16, "depth": 2, "device": "cpu"}
 VISION = {**ACT, "pretrained_backbone_weights": None, "use_vae": False}
 CROPPED = {"crop_shape": [32, 48], "pretrained_backbone_weights": None}
 SEEING = {**DIFFUSION, **CROPPED, "spatial_softmax_num_keypoints": 4}
-VQBET = {"type": "vqbet", "device": "cpu", "n_vqvae_training_steps": 2, "spatial_softmax_num_keypoints": 4, **CROPPED}
+VQBET = {
+    "type": "vqbet",
+    "device": "cpu",
+    "n_vqvae_training_steps": 2,
+    "spatial_softmax_num_keypoints": 4,
+    **CROPPED,
+}
 
 
 def config(settings: Any = MLP, **changes: Any) -> FitConfig:
@@ -43,7 +52,13 @@ def config(settings: Any = MLP, **changes: Any) -> FitConfig:
 def fit(dataset, tmp_path):
     """Fits a tiny policy to a dataset in a folder of the test's."""
 
-    def run(settings: Any = MLP, name: str = "run", data: Any = dataset, stop_after: int = 0, **more: Any) -> Path:
+    def run(
+        settings: Any = MLP,
+        name: str = "run",
+        data: Any = dataset,
+        stop_after: int = 0,
+        **more: Any,
+    ) -> Path:
         given = {key: more.pop(key) for key in ("resume", "weights") if key in more}
         done = 0
 
@@ -59,7 +74,10 @@ def fit(dataset, tmp_path):
 
 
 def saved(run: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted((run / "checkpoints/last").rglob("*.safetensors"))}
+    return {
+        path.name: path.read_bytes()
+        for path in sorted((run / "checkpoints/last").rglob("*.safetensors"))
+    }
 
 
 @pytest.mark.parametrize("settings", [MLP, {**MLP, "loss": "mixture"}, ACT, DIFFUSION], ids=str)
@@ -73,7 +91,10 @@ def test_a_resumed_fit_ends_with_the_same_bits(fit, tmp_path, settings):
     assert {"model.safetensors", "optimizer_state.safetensors"} <= straight.keys()
     assert straight == stopped
     one, other = (
-        [[record[key] for key in ("step", "loss", "val_loss")] for record in read_lines(tmp_path / name / METRICS_FILE)]
+        [
+            [record[key] for key in ("step", "loss", "val_loss")]
+            for record in read_lines(tmp_path / name / METRICS_FILE)
+        ]
         for name in ("straight", "stopped")
     )
     assert one == other
@@ -85,7 +106,9 @@ def test_a_resumed_fit_ends_with_the_same_bits(fit, tmp_path, settings):
     ids=lambda value: str(value["type"] if isinstance(value, dict) else value),
 )
 @pytest.mark.slow
-def test_two_steps_are_saved_resumed_and_act(fit, table, write, pictured, settings, observation, tmp_path):
+def test_two_steps_are_saved_resumed_and_act(
+    fit, table, write, pictured, settings, observation, tmp_path
+):
     data = write(table, spec=replace(pictured, cameras=("front",)))
     more = {"data": data, "observation": observation, "save_freq": 2}
     with pytest.raises(KeyboardInterrupt):
@@ -94,8 +117,15 @@ def test_two_steps_are_saved_resumed_and_act(fit, table, write, pictured, settin
     policy = LearnedPolicy.load(path)
     assert policy.checkpoint.observation == observation
     states, environments = observations(2)
-    assert policy.act(states, environments, {"front": np.zeros((2, 32, 48, 3), np.uint8)}).shape == (2, 4)
-    assert [record["step"] for record in read_lines(tmp_path / "run" / METRICS_FILE)] == [1, 2, 3, 4]
+    assert policy.act(
+        states, environments, {"front": np.zeros((2, 32, 48, 3), np.uint8)}
+    ).shape == (2, 4)
+    assert [record["step"] for record in read_lines(tmp_path / "run" / METRICS_FILE)] == [
+        1,
+        2,
+        3,
+        4,
+    ]
 
 
 def test_the_seed_decides_and_metrics_and_checkpoints_change_nothing(fit, weights):
@@ -112,11 +142,15 @@ def test_every_loss_learns_to_act(loss, table, write, fit):
     settings = {**MLP, "loss": loss, "components": 2, "width": 64}
 
     def errors(path: Path) -> np.ndarray:
-        actions = LearnedPolicy.load(path).act(table["observation.state"], table["observation.environment_state"])
+        actions = LearnedPolicy.load(path).act(
+            table["observation.state"], table["observation.environment_state"]
+        )
         return np.abs(actions - table["action"]).mean(0)
 
     before = errors(fit(settings, "before", data, steps=1))
-    after = errors(fit(settings, "after", data, steps=400, save_freq=400, log_freq=400, batch_size=64, lr=5e-3))
+    after = errors(
+        fit(settings, "after", data, steps=400, save_freq=400, log_freq=400, batch_size=64, lr=5e-3)
+    )
     assert after[:-1].mean() < 0.6 * before[:-1].mean()
     assert after[-1] < 0.01
 
@@ -127,7 +161,14 @@ def test_a_chunk_policy_learns_and_says_how(fit, tmp_path):
     first, _, last = read_lines(tmp_path / "run" / METRICS_FILE)
     assert last["loss"] < 0.7 * first["loss"]
     assert last["val_loss"] < first["val_loss"]
-    assert {"grad_norm", "lr", "samples_per_s", "update_s", "l1_loss", "val_l1_loss"} <= first.keys()
+    assert {
+        "grad_norm",
+        "lr",
+        "samples_per_s",
+        "update_s",
+        "l1_loss",
+        "val_l1_loss",
+    } <= first.keys()
 
 
 def test_held_out_episodes_are_never_learnt_from(dataset, tmp_path):
@@ -142,13 +183,20 @@ def test_frames_without_a_valid_label_do_not_touch_the_weights(table, write, fit
     rubbish = {key: column.copy() for key, column in table.items()}
     rubbish["action"][invalid] = 1e6
     rubbish["observation.environment_state"][invalid] = -1e6
-    a, b = (weights(fit(name=name, data=write(data, name))) for name, data in (("a", table), ("b", rubbish)))
+    a, b = (
+        weights(fit(name=name, data=write(data, name)))
+        for name, data in (("a", table), ("b", rubbish))
+    )
     assert all(torch.equal(a[key], b[key]) for key in a)
 
 
 def test_a_finished_run_is_neither_trained_over_nor_changed_by_resuming(fit, tmp_path, weights):
     before = weights(fit(ACT))
-    assert sorted(path.name for path in (tmp_path / "run/checkpoints").iterdir()) == ["000002", "000004", "last"]
+    assert sorted(path.name for path in (tmp_path / "run/checkpoints").iterdir()) == [
+        "000002",
+        "000004",
+        "last",
+    ]
     after = weights(fit(ACT, resume=True))
     assert all(torch.equal(before[key], after[key]) for key in before)
     with pytest.raises(FolderExistsError, match="--resume=true"):
@@ -168,7 +216,9 @@ def test_a_half_written_checkpoint_is_passed_over(fit, tmp_path, weights):
 def test_a_step_that_its_checkpoint_names_is_not_run_on_resuming(fit):
     path = fit(ACT) / "policy_preprocessor.json"
     values = json.loads(path.read_text())
-    values["steps"].append({"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil/x"}})
+    values["steps"].append(
+        {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil/x"}}
+    )
     path.write_text(json.dumps(values))
     with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
         fit(ACT, resume=True)
@@ -186,14 +236,18 @@ def test_nan_is_refused_with_column_and_frame(key, table, write, fit):
         fit(data=data)
 
 
-def test_a_warm_mlp_acts_as_the_one_it_came_from_in_the_units_of_new_data(table, write, fit, weights):
+def test_a_warm_mlp_acts_as_the_one_it_came_from_in_the_units_of_new_data(
+    table, write, fit, weights
+):
     first = fit(steps=50, data=write(table, "one"), name="first")
     wider = {key: column.copy() for key, column in table.items()}
     wider["observation.environment_state"] *= 3.0  # other statistics
     inputs = table["observation.state"], table["observation.environment_state"]
     for name, settings, more in (("a", MLP, {"init_from": first}), ("b", {"path": str(first)}, {})):
         second = fit(settings, name, write(wider, f"wider_{name}"), steps=1, lr=1e-12, **more)
-        assert not torch.equal(weights(first)["model.input_scale"], weights(second)["model.input_scale"])
+        assert not torch.equal(
+            weights(first)["model.input_scale"], weights(second)["model.input_scale"]
+        )
         before, after = (LearnedPolicy.load(path).act(*inputs) for path in (first, second))
         np.testing.assert_allclose(after, before, atol=2e-5)
 
@@ -220,7 +274,9 @@ def test_a_feature_that_never_moves_is_not_seen(table, fit):
     assert np.array_equal(before, policy.act(table["observation.state"], environment))
 
 
-def test_a_checkpoint_has_lerobots_layout_and_no_place_of_this_machine(fit, spec, dataset, tmp_path):
+def test_a_checkpoint_has_lerobots_layout_and_no_place_of_this_machine(
+    fit, spec, dataset, tmp_path
+):
     for settings in (MLP, ACT):
         path = fit(settings, settings["type"], init_from=fit(settings, f"first_{settings['type']}"))
         made = {file.name for file in path.iterdir()}
@@ -232,7 +288,9 @@ def test_a_checkpoint_has_lerobots_layout_and_no_place_of_this_machine(fit, spec
         origin = Checkpoint.open(path).origin
         assert origin is not None
         space = "joint_delta" if settings is MLP else "joint_target"
-        assert replace(origin, options={}, datasets=[]) == Origin.of(spec, {"mujoco": "3.11"}, action_space=space)
+        assert replace(origin, options={}, datasets=[]) == Origin.of(
+            spec, {"mujoco": "3.11"}, action_space=space
+        )
         assert origin.options["eval_split"] == 0.2
         assert origin.datasets == [{"name": "dataset", "frames": 240, "weight": None}]
         origin.check_fits(spec)
@@ -242,19 +300,34 @@ def test_several_datasets_are_one_in_the_units_of_all_and_the_shares_asked_for(s
     tables = make_table(0), make_table(1)
     for key in ("observation.state", "action"):
         tables[1][key] = tables[1][key] + np.float32(3.0)
-    roots = [write_table(table, tmp_path / name, spec)[0] for table, name in zip(tables, "ab", strict=True)]
+    roots = [
+        write_table(table, tmp_path / name, spec)[0]
+        for table, name in zip(tables, "ab", strict=True)
+    ]
     inputs = np.concatenate(
-        [np.hstack([one["observation.state"], one["observation.environment_state"]]) for one in tables]
+        [
+            np.hstack([one["observation.state"], one["observation.environment_state"]])
+            for one in tables
+        ]
     )
     for weights in ((), (3.0, 1.0)):
-        trainer = Trainer(roots, config(eval_split=0.0), tmp_path / f"run{len(weights)}", shares=weights)
+        trainer = Trainer(
+            roots, config(eval_split=0.0), tmp_path / f"run{len(weights)}", shares=weights
+        )
         np.testing.assert_allclose(trainer.policy.model.input_mean, inputs.mean(0), rtol=1e-5)
         drawn = np.concatenate([trainer.batch(step)["index"].numpy() for step in range(1000)])
         assert (drawn < 240).mean() == pytest.approx(0.75 if weights else 0.5, abs=0.02)
         assert trainer.fit().is_dir()
     chunks = Trainer(roots, config(ACT, eval_split=0.0), tmp_path / "act")
-    assert chunks.data.batch(np.array([239]))["action_is_pad"][0].tolist() == [False, True, True, True]
-    trainer = Trainer(roots, config(), tmp_path / "few", weights=(np.arange(480) < 20).astype(float))
+    assert chunks.data.batch(np.array([239]))["action_is_pad"][0].tolist() == [
+        False,
+        True,
+        True,
+        True,
+    ]
+    trainer = Trainer(
+        roots, config(), tmp_path / "few", weights=(np.arange(480) < 20).astype(float)
+    )
     assert max(int(trainer.batch(step)["index"].max()) for step in range(50)) < 20
 
 
@@ -285,19 +358,31 @@ sys.exit(max(elastic_launch(config, main)(sys.argv[1:]).values()))
 
 
 @pytest.mark.slow
-def test_two_processes_learn_what_one_learns_from_both_shares(warm_lerobot, dataset, tmp_path, weights):
+def test_two_processes_learn_what_one_learns_from_both_shares(
+    warm_lerobot, dataset, tmp_path, weights
+):
     """Every process takes its share of the batch; the gradients are averaged."""
     words = ["train", f"--dataset.root={dataset[0].root}", "--steps=3", "--save_freq=3"]
     words += ["--optimizer.type=sgd", "--optimizer.lr=0.001"]
-    words += [f"--policy.{k}={json.dumps(v) if not isinstance(v, str) else v}" for k, v in ACT.items()]
-    # One action a chunk: ACT's mean over all that is no padding is then the mean of the shares' means.
-    words += ["--policy.use_vae=false", "--policy.dropout=0.0", "--policy.chunk_size=1", "--policy.n_action_steps=1"]
+    words += [
+        f"--policy.{k}={json.dumps(v) if not isinstance(v, str) else v}" for k, v in ACT.items()
+    ]
+    # One action a chunk: ACT's mean over all that is no padding is then the mean of the shares'
+    # means.
+    words += [
+        "--policy.use_vae=false",
+        "--policy.dropout=0.0",
+        "--policy.chunk_size=1",
+        "--policy.n_action_steps=1",
+    ]
     two = tmp_path / "two"
     done = warm_lerobot.run("python", "-c", LAUNCH, *words, "--batch_size=4", f"--output_dir={two}")
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.count("checkpoint:") == 1
     assert main([*words, "--batch_size=8", f"--output_dir={tmp_path / 'one'}"]) == 0
-    one, both = (weights(run / "checkpoints/last/pretrained_model") for run in (tmp_path / "one", two))
+    one, both = (
+        weights(run / "checkpoints/last/pretrained_model") for run in (tmp_path / "one", two)
+    )
     assert all(torch.allclose(one[name], both[name], atol=1e-5) for name in one)
 
 
@@ -307,16 +392,23 @@ def somebodys(root: Path) -> Path:
 
     joints = [f"{name}.pos" for name in ("pan", "lift", "elbow", "flex", "roll", "gripper")]
     columns: dict[str, Any] = {
-        key: {"dtype": "float32", "shape": (6,), "names": joints} for key in ("observation.state", "action")
+        key: {"dtype": "float32", "shape": (6,), "names": joints}
+        for key in ("observation.state", "action")
     }
     size = {"dtype": "image", "shape": (32, 48, 3), "names": ["height", "width", "channels"]}
     columns |= {f"observation.images.{camera}": size for camera in ("front", "wrist")}
-    made = LeRobotDataset.create("somebody/so101", 30, columns, root=root, robot_type="so_follower", use_videos=False)
+    made = LeRobotDataset.create(
+        "somebody/so101", 30, columns, root=root, robot_type="so_follower", use_videos=False
+    )
     rng = np.random.default_rng(0)
     for _ in range(3):
         for _ in range(10):
             state = rng.normal(size=6).astype(np.float32)
-            frame = {"observation.state": state, "action": 0.9 * state, "task": "put the cube into the box"}
+            frame = {
+                "observation.state": state,
+                "action": 0.9 * state,
+                "task": "put the cube into the box",
+            }
             pictures = rng.integers(256, size=(2, 32, 48, 3), dtype=np.uint8)
             frame |= dict(zip((key for key in columns if "images" in key), pictures, strict=True))
             made.add_frame(frame)
@@ -328,23 +420,47 @@ def somebodys(root: Path) -> Path:
 def test_where_an_environment_fits_a_policy_the_next_command_evaluates_it(tmp_path, capsys):
     sample = shutil.copytree(Path(__file__).parents[2] / "datasets/sample", tmp_path / "sample")
     (sample / OURS).unlink()  # as LeRobot's tools do
-    assert main(["train", f"--dataset.root={sample}", "--steps=1", f"--output_dir={tmp_path / 'run'}"]) == 0
+    assert (
+        main(["train", f"--dataset.root={sample}", "--steps=1", f"--output_dir={tmp_path / 'run'}"])
+        == 0
+    )
     assert "next: manip-il eval --policy.path=" in capsys.readouterr().out
 
 
 @pytest.mark.slow
-def test_act_learns_from_somebodys_pictures_and_lerobot_train_goes_on(warm_lerobot, tmp_path, capsys):
+def test_act_learns_from_somebodys_pictures_and_lerobot_train_goes_on(
+    warm_lerobot, tmp_path, capsys
+):
     root, run = somebodys(tmp_path / "theirs"), tmp_path / "run"
-    words = ["train", f"--dataset.root={root}", f"--output_dir={run}", "--steps=4", "--save_freq=2", "--batch_size=4"]
-    words += [f"--policy.{k}={json.dumps(v) if not isinstance(v, str) else v}" for k, v in VISION.items()]
+    words = [
+        "train",
+        f"--dataset.root={root}",
+        f"--output_dir={run}",
+        "--steps=4",
+        "--save_freq=2",
+        "--batch_size=4",
+    ]
+    words += [
+        f"--policy.{k}={json.dumps(v) if not isinstance(v, str) else v}" for k, v in VISION.items()
+    ]
     assert main(words) == 1
-    assert "no observation.environment_state, which --observation=state needs" in capsys.readouterr().err
+    assert (
+        "no observation.environment_state, which --observation=state needs"
+        in capsys.readouterr().err
+    )
     assert main([*words, "--observation=images"]) == 0
-    assert "no simulator of this program fits the policy: joint_names differs" in capsys.readouterr().out
-    policy = LearnedPolicy.load(run / "checkpoints/last/pretrained_model", task="put the cube into the box")
+    assert (
+        "no simulator of this program fits the policy: joint_names differs"
+        in capsys.readouterr().out
+    )
+    policy = LearnedPolicy.load(
+        run / "checkpoints/last/pretrained_model", task="put the cube into the box"
+    )
     assert policy.checkpoint.origin.robot == "so101"
     pictures = {camera: np.zeros((1, 32, 48, 3), np.uint8) for camera in ("front", "wrist")}
-    assert policy.act(np.zeros((1, 6), np.float32), np.empty((1, 0), np.float32), pictures).shape == (1, 6)
+    assert policy.act(
+        np.zeros((1, 6), np.float32), np.empty((1, 0), np.float32), pictures
+    ).shape == (1, 6)
     again = [
         "dagger",
         "--robot.type=so101",

@@ -42,7 +42,15 @@ DIFFUSION = {  # one that draws
 CNN = {"type": "cnn", "channels": [4, 8], "keypoints": 4, "width": 8, "device": "cpu"}
 
 TINY: dict[str, dict[str, Any]] = {
-    "act": ACT | {"use_vae": False, "chunk_size": 5, "n_action_steps": 3, "pretrained_backbone_weights": None},
+    "act": (
+        ACT
+        | {
+            "use_vae": False,
+            "chunk_size": 5,
+            "n_action_steps": 3,
+            "pretrained_backbone_weights": None,
+        }
+    ),
     "diffusion": DIFFUSION | {"num_inference_steps": 2, "pretrained_backbone_weights": None},
 }
 
@@ -56,10 +64,15 @@ def write_checkpoint(
     origin: Origin | None = None,
     **options: Any,
 ) -> Path:
-    """A `pretrained_model` folder for data of `spec`; without `origin` as lerobot-train leaves it."""
+    """A `pretrained_model` folder for data of `spec`.
+
+    Without `origin` as lerobot-train leaves it.
+    """
     policy_types()  # registers all of them
     settings = {"device": "cpu", "push_to_hub": False} | TINY.get(kind, {}) | options
-    config = make_policy_config(kind, **{name: value for name, value in settings.items() if name != "type"})
+    config = make_policy_config(
+        kind, **{name: value for name, value in settings.items() if name != "type"}
+    )
     inputs = [STATE, *([ENVIRONMENT_STATE] if observation != "images" else [])]
     inputs += list(spec.image_keys) if observation != "state" else []
     config.input_features, config.output_features = policy_features(features(spec), inputs)
@@ -78,7 +91,9 @@ def write_checkpoint(
 def observations(rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Joint states (rows, 4) and environment states (rows, 6) of noise."""
     rng = np.random.default_rng(seed)
-    return rng.normal(size=(rows, 4)).astype(np.float32), rng.normal(size=(rows, 6)).astype(np.float32)
+    return rng.normal(size=(rows, 4)).astype(np.float32), rng.normal(size=(rows, 6)).astype(
+        np.float32
+    )
 
 
 def refused(policy: Path, words: str, longest: int = 1_000) -> None:

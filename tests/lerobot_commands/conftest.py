@@ -1,4 +1,6 @@
-"""LeRobot's commands as processes of their own, forked from one that has imported LeRobot and nothing of ours."""
+"""LeRobot's commands as processes of their own, forked from one that has imported LeRobot and
+nothing of ours.
+"""
 
 import json
 from collections.abc import Callable, Sequence
@@ -43,7 +45,11 @@ def record(tmp_path_factory) -> Callable[..., Path]:
 
     def run(name: str, episodes: int, *words: str) -> Path:
         root = tmp_path_factory.mktemp(name) / name
-        where = [f"--dataset.root={root}", f"--dataset.repo_id=someone/{name}", f"--dataset.num_episodes={episodes}"]
+        where = [
+            f"--dataset.root={root}",
+            f"--dataset.repo_id=someone/{name}",
+            f"--dataset.num_episodes={episodes}",
+        ]
         assert main(["record", "--task.type=reach", "--workers=1", *where, *words]) == 0
         return root
 
@@ -52,7 +58,9 @@ def record(tmp_path_factory) -> Callable[..., Path]:
 
 @dataclass(frozen=True)
 class Trial:
-    """One evaluation, in LeRobot's words and in ours: the first `count` seeds of the test stream."""
+    """One evaluation, in LeRobot's words and in ours: the first `count` seeds of the test
+    stream.
+    """
 
     env: EnvConfig
     count: int
@@ -73,12 +81,22 @@ class Trial:
         }
         if self.cameras is not None:
             words |= {"observation": "images", "cameras": ",".join(self.cameras.names)}
-            words |= {"observation_height": self.cameras.height, "observation_width": self.cameras.width}
+            words |= {
+                "observation_height": self.cameras.height,
+                "observation_width": self.cameras.width,
+            }
         return [f"--env.{name}={value}" for name, value in words.items()]
 
     def words(self, batch_size: int, asynchronous: bool) -> list[object]:
-        """For lerobot-eval and lerobot-train alike; the latter's seed is its evaluation's first too."""
-        flags = [f"--eval.n_episodes={self.count}", f"--eval.batch_size={batch_size}", f"--seed={self.seeds[0]}"]
+        """For lerobot-eval and lerobot-train alike.
+
+        The latter's seed is its evaluation's first too.
+        """
+        flags = [
+            f"--eval.n_episodes={self.count}",
+            f"--eval.batch_size={batch_size}",
+            f"--seed={self.seeds[0]}",
+        ]
         return [*self.env_words, *flags, f"--eval.use_async_envs={str(asynchronous).lower()}"]
 
     def ours(
@@ -112,7 +130,13 @@ def lerobots() -> Callable[[Path], dict[str, Any]]:
 @pytest.fixture(scope="session")
 def small_act() -> dict[str, Any]:
     """Options of a tiny ACT without downloads."""
-    sizes = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "n_decoder_layers": 1}
+    sizes = {
+        "dim_model": 32,
+        "n_heads": 2,
+        "dim_feedforward": 64,
+        "n_encoder_layers": 1,
+        "n_decoder_layers": 1,
+    }
     chunk = {"chunk_size": 5, "n_action_steps": 5, "use_vae": "false", "optimizer_lr": 1e-3}
     return {"type": "act", **sizes, **chunk, "pretrained_backbone_weights": "null", "device": "cpu"}
 
@@ -123,8 +147,15 @@ def act_words(small_act: dict[str, Any]) -> Callable[..., Sequence[str]]:
 
     def words(root: Path, output_dir: Path, steps: int) -> list[str]:
         policy = small_act | {"push_to_hub": "false"}
-        run = {"dataset.repo_id": f"someone/{root.name}", "dataset.root": root, "output_dir": output_dir}
+        run = {
+            "dataset.repo_id": f"someone/{root.name}",
+            "dataset.root": root,
+            "output_dir": output_dir,
+        }
         run |= dict.fromkeys(("steps", "save_freq", "env_eval_freq"), steps) | {"num_workers": 0}
-        return [*(f"--policy.{key}={value}" for key, value in policy.items()), *(f"--{k}={v}" for k, v in run.items())]
+        return [
+            *(f"--policy.{key}={value}" for key, value in policy.items()),
+            *(f"--{k}={v}" for k, v in run.items()),
+        ]
 
     return words

@@ -33,8 +33,12 @@ def vector_env(config: ManipILEnv, count: int) -> Any:
         ("both", {STATE: (8,), POSES: (25,), PICTURE: (3, 32, 48)}),
     ],
 )
-def test_a_policys_inputs_are_those_of_the_chosen_observation(observation: str, inputs: dict[str, tuple[int, ...]]):
-    config = ManipILEnv(observation=observation, cameras="wrist", observation_height=32, observation_width=48)
+def test_a_policys_inputs_are_those_of_the_chosen_observation(
+    observation: str, inputs: dict[str, tuple[int, ...]]
+):
+    config = ManipILEnv(
+        observation=observation, cameras="wrist", observation_height=32, observation_width=48
+    )
     assert shapes(config) == inputs | {"action": (8,)}
 
 

@@ -1,4 +1,6 @@
-"""lerobot-train and lerobot-eval on our datasets, policies and environments: the same success for every seed."""
+"""lerobot-train and lerobot-eval on our datasets, policies and environments: the same success
+for every seed.
+"""
 
 import pytest
 
@@ -23,12 +25,19 @@ def test_lerobot_eval_finds_our_success_for_every_seed_and_needs_no_word_of_the_
 ):
     options = small_act if policy == "act" else {"type": "mlp", "width": 32}
     words = [f"--policy.{name}={value}" for name, value in options.items()]
-    words += [f"--action_space={space}", "--batch_size=64", "--steps=300", f"--output_dir={tmp_path / 'run'}"]
+    words += [
+        f"--action_space={space}",
+        "--batch_size=64",
+        "--steps=300",
+        f"--output_dir={tmp_path / 'run'}",
+    ]
     assert main(["train", f"--dataset.root={demos}", *words]) == 0
     path = tmp_path / "run/checkpoints/last/pretrained_model"
     evaluation = trial(make_config("panda", "reach", horizon=40, tolerance=0.1), 6)
     few = evaluation.words(batch_size, asynchronous=batch_size == 2)
-    command("lerobot-eval", f"--policy.path={path}", *few, UNFILMED, f"--output_dir={tmp_path / 'eval'}")
+    command(
+        "lerobot-eval", f"--policy.path={path}", *few, UNFILMED, f"--output_dir={tmp_path / 'eval'}"
+    )
     theirs, ours = lerobots(tmp_path / "eval"), evaluation.ours(path)
     assert theirs["successes"] == [episode.success for episode in ours]
     assert theirs["sum_rewards"] == [episode.ret for episode in ours]

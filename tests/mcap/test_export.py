@@ -30,19 +30,31 @@ FEATURES: dict[str, dict[str, Any]] = {
     "flag": {"dtype": "bool", "shape": (1,), "names": None},
     "note": {"dtype": "string", "shape": (1,), "names": None},
     "matrix": {"dtype": "float64", "shape": (2, 3), "names": None},
-    "observation.images.top": {"dtype": "image", "shape": (8, 12, 3), "names": ["height", "width", "channels"]},
-    "observation.images.side": {"dtype": "video", "shape": (64, 64, 3), "names": ["height", "width", "channels"]},
+    "observation.images.top": {
+        "dtype": "image",
+        "shape": (8, 12, 3),
+        "names": ["height", "width", "channels"],
+    },
+    "observation.images.side": {
+        "dtype": "video",
+        "shape": (64, 64, 3),
+        "names": ["height", "width", "channels"],
+    },
 }
 
 
 @pytest.fixture(scope="module")
-def ours(tmp_path_factory: pytest.TempPathFactory, episodes: list[Episode], spec: s.EnvironmentSpec) -> Path:
+def ours(
+    tmp_path_factory: pytest.TempPathFactory, episodes: list[Episode], spec: s.EnvironmentSpec
+) -> Path:
     root = tmp_path_factory.mktemp("ours") / "d"
     write_dataset(episodes, root, spec, fingerprint={})
     return root
 
 
-def lerobots(root: Path, fps: float, features: dict[str, Any], frames: list[list[dict[str, Any]]]) -> Path:
+def lerobots(
+    root: Path, fps: float, features: dict[str, Any], frames: list[list[dict[str, Any]]]
+) -> Path:
     """A dataset of LeRobot's own, an episode a list of frames."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -89,11 +101,23 @@ def test_an_export_read_by_others_holds_the_datasets_values(ours: Path, tmp_path
     for path in paths:
         found = by_topic(path)
         rows = slice(start, start := start + len(found["/task"]))
-        states = [[joint.position for joint in message.joints] for message in found["/observation/state"]]
+        states = [
+            [joint.position for joint in message.joints] for message in found["/observation/state"]
+        ]
         assert states == table[s.STATE][rows].tolist()
-        assert [joint.name for joint in found["/action"][0].joints] == ["shoulder", "elbow", "gripper"]
-        for key, topic in ((s.SIM_STATE, "/sim_state"), (s.SEED, "/seed"), (s.REWARD, "/next/reward")):
-            values = [[scalar["value"] for scalar in message["scalars"]] for message in found[topic]]
+        assert [joint.name for joint in found["/action"][0].joints] == [
+            "shoulder",
+            "elbow",
+            "gripper",
+        ]
+        for key, topic in (
+            (s.SIM_STATE, "/sim_state"),
+            (s.SEED, "/seed"),
+            (s.REWARD, "/next/reward"),
+        ):
+            values = [
+                [scalar["value"] for scalar in message["scalars"]] for message in found[topic]
+            ]
             assert np.ravel(values).tolist() == table[key][rows].ravel().tolist()
         labels = [scalar["label"] for scalar in found["/sim_state"][0]["scalars"]]
         assert labels == [f"sim_state_{place}" for place in range(7)]  # as LeRobot labels them
@@ -102,9 +126,14 @@ def test_an_export_read_by_others_holds_the_datasets_values(ours: Path, tmp_path
     assert [path.read_bytes() for path in paths] == [path.read_bytes() for path in again]
 
 
-def test_a_number_that_is_not_finite_is_refused_and_a_column_without_a_place_left_out(ours: Path, tmp_path: Path):
+def test_a_number_that_is_not_finite_is_refused_and_a_column_without_a_place_left_out(
+    ours: Path, tmp_path: Path
+):
     root = shutil.copytree(ours, tmp_path / "d")
-    odd = {"text": {"dtype": "language"}, "depth": {"dtype": "image", "info": {"is_depth_map": True}}}
+    odd = {
+        "text": {"dtype": "language"},
+        "depth": {"dtype": "image", "info": {"is_depth_map": True}},
+    }
     odd = {key: {"shape": [4, 4, 3], "names": None, **one} for key, one in odd.items()}
     edit_json(root / layout.INFO, lambda info: info["features"].update(odd))
     assert left_out(Dataset.open(root).info) == ["text", "depth"]
@@ -121,7 +150,10 @@ def test_a_fractional_rate_comes_back_with_its_exact_times(tmp_path: Path) -> No
     root = lerobots(tmp_path / "d", fps, {"action": FEATURES["action"]}, [frames])
     [path] = export(root, tmp_path / "out")
     assert decoded(path.read_bytes())[-1][1] == 899 * 10**9 // Fraction(fps).limit_denominator(1001)
-    assert import_files([path], tmp_path / "new", load_mapping(tmp_path / "out" / MAPPING)).frames == 900
+    assert (
+        import_files([path], tmp_path / "new", load_mapping(tmp_path / "out" / MAPPING)).frames
+        == 900
+    )
     left, right = Dataset.open(root), Dataset.open(tmp_path / "new")
     assert right.fps == fps
     for key in ("action", "timestamp"):
@@ -138,11 +170,24 @@ def test_lerobots_comes_back_with_its_tasks_odd_columns_and_pictures(tmp_path: P
     assert import_files(list_files(tmp_path / "out"), tmp_path / "new", mapping).frames == 9
     left, right = Dataset.open(root), Dataset.open(tmp_path / "new")
     assert (right.fps, right.info.robot) == (30, "")
-    texts = [[one.tasks[i] for i in one.columns(["task_index"])["task_index"].tolist()] for one in (left, right)]
-    assert texts[0] == texts[1] == 2 * ["wipe"] + 2 * ["fold, 100 %"] + 2 * ["wipe"] + 3 * ["fold, 100 %"]
+    texts = [
+        [one.tasks[i] for i in one.columns(["task_index"])["task_index"].tolist()]
+        for one in (left, right)
+    ]
+    assert (
+        texts[0]
+        == texts[1]
+        == 2 * ["wipe"] + 2 * ["fold, 100 %"] + 2 * ["wipe"] + 3 * ["fold, 100 %"]
+    )
     names = [key for key in left.features if key not in (*left.cameras, "task_index")]
     for key, values in left.columns(names).items():
         new = right.columns(names)[key]
-        assert (new.dtype, new.tolist(), right.features[key]) == (values.dtype, values.tolist(), left.features[key])
+        assert (new.dtype, new.tolist(), right.features[key]) == (
+            values.dtype,
+            values.tolist(),
+            left.features[key],
+        )
     for key in left.cameras:
-        np.testing.assert_array_equal(right.frames(key, np.arange(9)), left.frames(key, np.arange(9)))
+        np.testing.assert_array_equal(
+            right.frames(key, np.arange(9)), left.frames(key, np.arange(9))
+        )

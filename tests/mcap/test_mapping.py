@@ -15,14 +15,27 @@ from .use import load
 ROOT = Path(__file__).resolve().parents[2]
 NUMBER = {"topic": "/a", "field": "x", "dtype": "float32", "resample": "previous", "tolerance": 0.1}
 CAMERA = {"topic": "/c", "video": True, "resample": "nearest", "tolerance": 0}
-TREE: dict[str, Any] = {"fps": 20, "task": "do it", "features": {"action": NUMBER, "observation.images.c": CAMERA}}
+TREE: dict[str, Any] = {
+    "fps": 20,
+    "task": "do it",
+    "features": {"action": NUMBER, "observation.images.c": CAMERA},
+}
 
 
 def test_a_mapping_is_its_file_and_the_example_loads(tmp_path: Path) -> None:
-    number, camera = TopicSource("/a", "previous", 0.1, "x", "float32"), TopicSource("/c", "nearest", 0, video=True)
-    assert load(tmp_path, **TREE) == Mapping(20, "do it", {"action": number, "observation.images.c": camera})
+    number, camera = (
+        TopicSource("/a", "previous", 0.1, "x", "float32"),
+        TopicSource("/c", "nearest", 0, video=True),
+    )
+    assert load(tmp_path, **TREE) == Mapping(
+        20, "do it", {"action": number, "observation.images.c": camera}
+    )
     example = load_mapping(ROOT / "configs/mcap/panda.yaml")
-    assert [one.topic for one in example.sources.values()][:3] == ["/joint_states", "/action", "/scalars"]
+    assert [one.topic for one in example.sources.values()][:3] == [
+        "/joint_states",
+        "/action",
+        "/scalars",
+    ]
 
 
 def test_a_path_leads_to_values_or_says_where_it_ends() -> None:
@@ -30,8 +43,13 @@ def test_a_path_leads_to_values_or_says_where_it_ends() -> None:
     for number, name in enumerate(["shoulder", "wrist.1"]):
         joints.joints.add(name=name, position=number / 2)
     assert values_at("joints[:].position", joints) == [0.0, 0.5]
-    assert values_at("joints[name=wrist.1].position", joints) == values_at("a b[1]", {"a b": [0, 0.5]}) == [0.5]
-    ros = type("JointState", (SimpleNamespace,), {"__slots__": ["position"]})()  # as mcap-ros2-support makes them
+    assert (
+        values_at("joints[name=wrist.1].position", joints)
+        == values_at("a b[1]", {"a b": [0, 0.5]})
+        == [0.5]
+    )
+    # as mcap-ros2-support makes them
+    ros = type("JointState", (SimpleNamespace,), {"__slots__": ["position"]})()
     ros.position = [1.5, 2.5]
     assert values_at("position", ros) == [1.5, 2.5]
     for path, why in (
@@ -46,12 +64,22 @@ def test_a_path_leads_to_values_or_says_where_it_ends() -> None:
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("robot_type", "[1, 2]"), ("task", '"\\ud800"'), ("names", '["\\ud800"]'), ("names", "[2001-01-01]")],
+    [
+        ("robot_type", "[1, 2]"),
+        ("task", '"\\ud800"'),
+        ("names", '["\\ud800"]'),
+        ("names", "[2001-01-01]"),
+    ],
 )
-def test_what_a_dataset_cannot_hold_is_refused_before_an_episode_is_read(key: str, value: str, tmp_path: Path) -> None:
+def test_what_a_dataset_cannot_hold_is_refused_before_an_episode_is_read(
+    key: str, value: str, tmp_path: Path
+) -> None:
     column = "{topic: /a, field: x, dtype: float32, resample: nearest, tolerance: 1, names: NAMES}"
     told = {"robot_type": "arm", "task": "t", "names": "null"} | {key: value}
-    text = f"fps: 10\nrobot_type: {told['robot_type']}\ntask: {told['task']}\nfeatures: {{action: {column}}}\n"
+    text = (
+        f"fps: 10\nrobot_type: {told['robot_type']}\ntask: {told['task']}\nfeatures: {{action:"
+        f" {column}}}\n"
+    )
     (tmp_path / "m.yaml").write_text(text.replace("NAMES", told["names"]))
     with pytest.raises(UsageError, match=r"m\.yaml") as error:
         load_mapping(tmp_path / "m.yaml")

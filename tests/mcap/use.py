@@ -21,22 +21,35 @@ Messages = Iterable[tuple[int, Any]]  # stamp [ms], content
 def decoded(data: bytes) -> list[tuple[str, int, Any]]:
     """Every message's topic, stamp [ns] and content, as others read them."""
     found: list[tuple[str, int, Any]] = []
-    for schema, channel, message in make_reader(io.BytesIO(data), validate_crcs=True).iter_messages():
+    for schema, channel, message in make_reader(
+        io.BytesIO(data), validate_crcs=True
+    ).iter_messages():
         decoder = DecoderFactory().decoder_for(channel.message_encoding, schema) or json.loads
         found.append((channel.topic, message.log_time, decoder(message.data)))
     return found
 
 
 def load(folder: Path, features: Any, **more: Any) -> Mapping:
-    """The mapping that a file of these features is, at 10 frames a second unless `more` says otherwise."""
+    """The mapping that a file of these features is, at 10 frames a second unless `more` says
+    otherwise.
+    """
     path = folder / "m.yaml"
-    path.write_text(yaml.safe_dump({"fps": 10, "task": "t", "features": features, **more}), encoding="utf-8")
+    path.write_text(
+        yaml.safe_dump({"fps": 10, "task": "t", "features": features, **more}), encoding="utf-8"
+    )
     return load_mapping(path)
 
 
 def feature(topic: str = "/a", **changes: Any) -> dict[str, Any]:
     """A column of the field `x` in a mapping."""
-    return {"topic": topic, "field": "x", "dtype": "float64", "resample": "nearest", "tolerance": 0.02, **changes}
+    return {
+        "topic": topic,
+        "field": "x",
+        "dtype": "float64",
+        "resample": "nearest",
+        "tolerance": 0.02,
+        **changes,
+    }
 
 
 def ramp(stamps: Iterable[int]) -> list[tuple[int, Any]]:

@@ -1,4 +1,6 @@
-"""Datasets whose progress is known, without a simulator: an object is brought along one axis, well or badly."""
+"""Datasets whose progress is known, without a simulator: an object is brought along one axis,
+well or badly.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -26,12 +28,19 @@ def _one_thread():
 
 
 @pytest.fixture(scope="session")
-def datasets(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, spec: s.EnvironmentSpec) -> Path:
-    """A folder with the datasets `good`, whose episodes get to the end, `bad`, whose episodes do not, and `other`."""
+def datasets(
+    tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, spec: s.EnvironmentSpec
+) -> Path:
+    """A folder with the datasets `good`, whose episodes get to the end, `bad`, whose episodes do
+    not, and `other`.
+    """
     folder = tmp_path_factory.mktemp("supply")
     spec = replace(spec, robot="arm")  # none that is known here, whose columns would be compared
     for number, (name, length) in enumerate(LENGTHS.items()):
-        made = [brought(make_episode(100 * number + i, length, name == "good"), spec, name == "good") for i in range(8)]
+        made = [
+            brought(make_episode(100 * number + i, length, name == "good"), spec, name == "good")
+            for i in range(8)
+        ]
         write(folder / name, made, spec)
     write(folder / "other", [make_episode(7, 30)], replace(spec, task="reach"))
     return folder
@@ -60,7 +69,10 @@ def error(capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
 
 
 def brought(episode: Episode, spec: s.EnvironmentSpec, well: bool) -> Episode:
-    """The episode with its object on the way from 0 to 1, all of it or a third and back; progress is how far it is."""
+    """The episode with its object on the way from 0 to 1, all of it or a third and back.
+
+    Progress is how far it is.
+    """
     rng, steps = np.random.default_rng(episode.seed), len(episode)
     way = np.linspace(0, 1, steps) if well else 0.35 * np.sin(np.linspace(0, np.pi, steps))
     place = way + rng.normal(size=steps) * 0.01

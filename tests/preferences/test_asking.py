@@ -34,7 +34,9 @@ def pairs(clips) -> Pairs:
 
 @pytest.fixture(scope="module")
 def page(pairs, tmp_path_factory) -> Path:
-    shades = [encode_mp4([np.full((48, 48, 3), 20 * n, np.uint8)] * 5, 10) for n in range(2 * COUNT)]
+    shades = [
+        encode_mp4([np.full((48, 48, 3), 20 * n, np.uint8)] * 5, 10) for n in range(2 * COUNT)
+    ]
     path = tmp_path_factory.mktemp("ask") / "ask.html"
     films = [shades[2 * n : 2 * n + 2] for n in range(COUNT)]
     path.write_text(render_page(pairs, "Lift the <b>cube</b>.", films), encoding="utf-8")
@@ -55,7 +57,9 @@ def saved(window: Opened, pairs: Pairs, folder: Path) -> Preferences:
     return Preferences.read(folder / "preferences.json", [pairs])
 
 
-def test_keys_answer_undo_and_skip_and_the_download_is_what_fit_reads(browser, page, pairs, tmp_path):
+def test_keys_answer_undo_and_skip_and_the_download_is_what_fit_reads(
+    browser, page, pairs, tmp_path
+):
     with opened(browser, page, 1280) as window:
         assert window.page.inner_text(".instruction") == "Lift the <b>cube</b>."
         assert count(window) == "Pair 1 of 4"
@@ -66,14 +70,18 @@ def test_keys_answer_undo_and_skip_and_the_download_is_what_fit_reads(browser, p
         assert count(window) == "4 pairs answered"
         window.page.keyboard.press("ArrowRight")  # answers nothing more
         found = saved(window, pairs, tmp_path)
-        assert [(one.pair, one.answer) for one in found.answers] == list(enumerate(("left", "equal", "skip", "right")))
+        assert [(one.pair, one.answer) for one in found.answers] == list(
+            enumerate(("left", "equal", "skip", "right"))
+        )
         assert found.who == "Ada"
         assert all(one.when for one in found.answers)
         assert (window.console, window.requests) == ([], [])
 
 
 def test_taps_on_a_phone_answer(browser, page):
-    context = browser.new_context(viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True)
+    context = browser.new_context(
+        viewport={"width": 390, "height": 780}, has_touch=True, is_mobile=True
+    )
     try:
         context.set_default_timeout(1000 * PATIENCE)
         phone = context.new_page()
@@ -113,7 +121,9 @@ def test_the_page_opened_again_has_the_answers_and_the_name(browser, page):
 
 
 def test_no_script_but_its_own_runs(browser, page, tmp_path):
-    slipped = page.read_text().replace("</main>", "<script>document.title = 'slipped in'</script></main>")
+    slipped = page.read_text().replace(
+        "</main>", "<script>document.title = 'slipped in'</script></main>"
+    )
     (tmp_path / "ask.html").write_text(slipped)
     with opened(browser, tmp_path / "ask.html", 1280) as window:
         assert window.page.title() != "slipped in"

@@ -25,28 +25,47 @@ def run(line: str) -> int:
 
 def test_a_reward_is_learnt_and_weighs_the_frames_of_a_clone(here, capsys):
     assert run("reward pairs good bad --clip=10 --count=40") == 0
-    assert run("reward answer pairs.json --sources=good,bad --teacher=mistaken:0.1 --output=a.json") == 0
+    assert (
+        run("reward answer pairs.json --sources=good,bad --teacher=mistaken:0.1 --output=a.json")
+        == 0
+    )
     assert run("reward answer pairs.json --sources=good,bad --teacher=perfect --output=b.json") == 0
-    assert run("reward fit pairs.json a.json b.json --sources=good,bad --members=3 --output_dir=reward") == 0
+    assert (
+        run(
+            "reward fit pairs.json a.json b.json --sources=good,bad --members=3 --output_dir=reward"
+        )
+        == 0
+    )
     assert "80 answers about 40 pairs" in capsys.readouterr().out
     found = json.loads((here / "reward" / "fit.json").read_text())
     assert 30 <= found["agreement_with_progress"]["of"] <= 40
     assert run("data score bad --reward=reward --output_dir=scores") == 0
-    words = "--dataset.root=bad --weights=scores/rabc.parquet --steps=2 --batch_size=8 --policy.width=8"
+    words = (
+        "--dataset.root=bad --weights=scores/rabc.parquet --steps=2 --batch_size=8 --policy.width=8"
+    )
     assert run(f"train {words} --output_dir=weighted") == 0
     capsys.readouterr()
     assert (here / "weighted/checkpoints/last/pretrained_model/model.safetensors").is_file()
     assert run("reward pairs good bad --clip=10 --count=5 --reward=reward --output=more.json") == 0
     assert Pairs.read(here / "more.json").chosen == "where rewards disagree"
     assert run("reward answer more.json --sources=good,bad --output=c.json") == 0
-    words = "pairs.json a.json c.json --more_pairs=more.json --sources=good,bad --members=3 --output_dir=again"
+    words = (
+        "pairs.json a.json c.json --more_pairs=more.json --sources=good,bad --members=3"
+        " --output_dir=again"
+    )
     assert run(f"reward fit {words}") == 0
     assert "45 answers about 45 pairs" in capsys.readouterr().out
-    assert run("reward fit pairs.json c.json --sources=good,bad --members=3 --output_dir=third") == 1
+    assert (
+        run("reward fit pairs.json c.json --sources=good,bad --members=3 --output_dir=third") == 1
+    )
     assert "sha256 of the pairs differs: c.json has" in capsys.readouterr().err
 
 
 def test_true_progress_scores_without_a_reward(here, capsys):
     assert run("data score good --reward=progress --output_dir=scores") == 0
     assert len(json.loads((here / "scores/scores.json").read_text())["episodes"]) == 8
-    assert {path.name for path in (here / "scores").iterdir()} == {"config.yaml", "rabc.parquet", "scores.json"}
+    assert {path.name for path in (here / "scores").iterdir()} == {
+        "config.yaml",
+        "rabc.parquet",
+        "scores.json",
+    }

@@ -1,4 +1,6 @@
-"""The Bradley-Terry reward: what it learns, that it is the same everywhere, and what a folder of it may hold."""
+"""The Bradley-Terry reward: what it learns, that it is the same everywhere, and what a folder of
+it may hold.
+"""
 
 from dataclasses import replace
 
@@ -48,7 +50,8 @@ def test_a_pair_is_held_out_whole_and_every_fold_is_in_turn():
 
 
 def test_what_is_said_of_a_held_out_pair_does_not_depend_on_its_answer(clips, answers):
-    """Answers of one fold turned round change the networks that learn from them, not the one that leaves them out.
+    """Answers of one fold turned round change the networks that learn from them, not the one that
+    leaves them out.
 
     The number of epochs is chosen by all answers, so both fits are of one epoch.
     """
@@ -65,16 +68,26 @@ def test_what_is_said_of_a_held_out_pair_does_not_depend_on_its_answer(clips, an
 
 def test_the_same_seed_gives_the_same_weights(fitted, clips, answers):
     again = fit_answers(clips, answers, SHAPE, 0).network.state_dict()
-    assert all(torch.equal(value, again[name]) for name, value in fitted.network.state_dict().items())
+    assert all(
+        torch.equal(value, again[name]) for name, value in fitted.network.state_dict().items()
+    )
 
 
 def test_ways_are_the_triples_that_lead_from_one_thing_to_another(spec):
-    names = ("ee.x", "goal_from_object.x", "goal_from_object.y", "goal_from_object.z", "object_from_ee.x")
+    names = (
+        "ee.x",
+        "goal_from_object.x",
+        "goal_from_object.y",
+        "goal_from_object.z",
+        "object_from_ee.x",
+    )
     assert ways_of(replace(spec, environment_state_names=names)) == ((4, 5, 6), (4, 5))
 
 
 def test_a_reward_is_for_one_task_and_observation(folder, clips, datasets):
     reward = LearnedReward.load(folder)
     reward.check_fits("here", clips.frames[0].spec)
-    with pytest.raises(MismatchError, match=r"task differs: the reward has lift, .*other has reach"):
+    with pytest.raises(
+        MismatchError, match=r"task differs: the reward has lift, .*other has reach"
+    ):
         reward.check_fits(str(datasets / "other"), Dataset.open(datasets / "other").spec)

@@ -48,8 +48,13 @@ def test_an_ensemble_chooses_the_pairs_that_it_disagrees_about(datasets):
     def members(inputs):
         return np.random.default_rng(1).normal(size=(3, inputs.shape[1])) @ inputs.T
 
-    roots, reward = [datasets / "good", datasets / "bad"], SimpleNamespace(members=members, check_fits=lambda *_: None)
-    clips = [choose_pairs(roots, 10, 20, 0, np.random.default_rng(0), one) for one in (reward, None)]
+    roots, reward = (
+        [datasets / "good", datasets / "bad"],
+        SimpleNamespace(members=members, check_fits=lambda *_: None),
+    )
+    clips = [
+        choose_pairs(roots, 10, 20, 0, np.random.default_rng(0), one) for one in (reward, None)
+    ]
     doubts = [disagreement(one, members).mean() for one in clips]
     assert doubts[0] > 1.1 * doubts[1]
 
@@ -71,7 +76,9 @@ def test_pairs_are_the_same_from_their_file(clips, tmp_path):
 def test_a_dataset_that_was_changed_since_is_refused(clips):
     tree = clips.pairs.to_json()
     tree["sources"][0]["sha256"] = "0" * 64
-    with pytest.raises(ManipError, match=r"dataset .*good is not among the sources, or has changed since"):
+    with pytest.raises(
+        ManipError, match=r"dataset .*good is not among the sources, or has changed since"
+    ):
         read_clips(Pairs.from_json(tree), clips.roots)
 
 

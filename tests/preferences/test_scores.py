@@ -19,7 +19,9 @@ def scored(datasets) -> Scores:
     """Both datasets as one, scored by true progress with a little noise."""
     good, bad = (read_frames(datasets / name) for name in ("good", "bad"))
     columns = ("inputs", "progress", "success")
-    joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in (good, bad)]) for name in columns}
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(one, name) for one in (good, bad)]) for name in columns
+    }
     data = Frames(good.spec, episodes=np.concatenate([good.episodes, bad.episodes + 8]), **joined)
     noise = np.random.default_rng(0).normal(size=len(data.inputs)) * 0.02
     return Scores("both", "a test", data, np.clip(joined["progress"] + noise, 0, 1))
@@ -45,7 +47,9 @@ def test_weights_are_lerobots(ahead, scored, tmp_path):
     path = tmp_path / "rabc.parquet"
     write_weights(path, scored)
     theirs = RABCWeights(path, chunk_size=ahead, device=torch.device("cpu"))
-    deltas = np.array([theirs._compute_delta(index) for index in range(len(scored.frames))], np.float32)
+    deltas = np.array(
+        [theirs._compute_delta(index) for index in range(len(scored.frames))], np.float32
+    )
     ours = rabc_weights(path, scored.data.episodes, ahead)
     assert ours == pytest.approx(theirs._compute_weights(deltas), abs=1e-5)
     assert {0.0, 1.0} < set(ours.tolist())

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from manip_il.chapter.preferences.fitting import true_difference
-from manip_il.chapter.preferences.pairs import Answer, Clips, Preferences, Teacher, answer_pairs, join_answers
+from manip_il.chapter.preferences.pairs import (
+    Answer,
+    Clips,
+    Preferences,
+    Teacher,
+    answer_pairs,
+    join_answers,
+)
 
 from .conftest import clips_of
 
@@ -42,18 +49,25 @@ def test_a_boltzmann_teacher_errs_the_more_the_higher_its_temperature(many):
 
 def test_clips_that_are_alike_are_answered_equal(many):
     alike = tuple(replace(one, progress=np.full(len(one.inputs), 0.5)) for one in many.frames)
-    assert set(Teacher.parse("perfect").answers(Clips(many.pairs, many.roots, alike), np.random.default_rng(0))) == {
-        "equal"
-    }
+    assert set(
+        Teacher.parse("perfect").answers(
+            Clips(many.pairs, many.roots, alike), np.random.default_rng(0)
+        )
+    ) == {"equal"}
 
 
 def test_the_same_seed_answers_the_same(many):
-    given = [answer_pairs(Teacher.parse("mistaken"), many, np.random.default_rng(5)).to_json() for _ in range(2)]
+    given = [
+        answer_pairs(Teacher.parse("mistaken"), many, np.random.default_rng(5)).to_json()
+        for _ in range(2)
+    ]
     assert given[0] == given[1]
 
 
 def test_skips_are_counted_and_all_answers_kept(clips):
-    one = Preferences("p", "a", (Answer(0, "left"), Answer(1, "right"), Answer(2, "skip"), Answer(3, "equal")))
+    one = Preferences(
+        "p", "a", (Answer(0, "left"), Answer(1, "right"), Answer(2, "skip"), Answer(3, "equal"))
+    )
     other = Preferences("p", "b", (Answer(0, "right"), Answer(1, "right")))
     found = join_answers([one, other])
     assert found.skipped == 1

@@ -1,4 +1,6 @@
-"""Small worlds for inverse reinforcement learning: grids with things on them, and demonstrations of a known taste."""
+"""Small worlds for inverse reinforcement learning: grids with things on them, and demonstrations
+of a known taste.
+"""
 
 import itertools
 
@@ -8,22 +10,38 @@ from manip_il.chapter.rewards.max_entropy import SoftPlan
 from manip_il.tasks.carry.grid import Demonstration, PathProblem, cheapest_path, plan
 
 
-def grid(rng: np.random.Generator, shape: tuple[int, ...] = (6, 5), things: int = 2, step: float = 1.0) -> PathProblem:
-    """A grid with neighbours in all directions: length, then what each of some things, at drawn places, adds near it.
+def grid(
+    rng: np.random.Generator, shape: tuple[int, ...] = (6, 5), things: int = 2, step: float = 1.0
+) -> PathProblem:
+    """A grid with neighbours in all directions: length, then what each of some things, at drawn
+    places, adds near it.
 
     The goal is the last node.
     """
-    places = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, len(shape)) * step
+    places = (
+        np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, len(shape))
+        * step
+    )
     number = np.arange(len(places)).reshape(shape)
     near = [
-        np.exp(-0.5 * (np.linalg.norm(places - rng.uniform(0, step * (np.array(shape) - 1)), axis=1) / step) ** 2)
+        np.exp(
+            -0.5
+            * (np.linalg.norm(places - rng.uniform(0, step * (np.array(shape) - 1)), axis=1) / step)
+            ** 2
+        )
         for _ in range(things)
     ]
     edges = []
     for move in itertools.product((-1, 0, 1), repeat=len(shape)):
         if any(move):
-            here = tuple(slice(max(0, -one), size - max(0, one)) for one, size in zip(move, shape, strict=True))
-            there = tuple(slice(max(0, one), size - max(0, -one)) for one, size in zip(move, shape, strict=True))
+            here = tuple(
+                slice(max(0, -one), size - max(0, one))
+                for one, size in zip(move, shape, strict=True)
+            )
+            there = tuple(
+                slice(max(0, one), size - max(0, -one))
+                for one, size in zip(move, shape, strict=True)
+            )
             edges.append(np.stack([number[here].ravel(), number[there].ravel()], axis=1))
     edges = np.concatenate(edges)
     length = np.linalg.norm(places[edges[:, 0]] - places[edges[:, 1]], axis=1)
@@ -31,9 +49,19 @@ def grid(rng: np.random.Generator, shape: tuple[int, ...] = (6, 5), things: int 
     return PathProblem(edges, np.stack(features, axis=1), len(places), len(places) - 1)
 
 
-def acyclic(rng: np.random.Generator, nodes: int = 7, features: int = 3, share: float = 0.6) -> PathProblem:
-    """A random graph without circles: edges lead to higher numbers, one chain through all; the last is the goal."""
-    pairs = [(i, j) for i in range(nodes) for j in range(i + 1, nodes) if j == i + 1 or rng.random() < share]
+def acyclic(
+    rng: np.random.Generator, nodes: int = 7, features: int = 3, share: float = 0.6
+) -> PathProblem:
+    """A random graph without circles: edges lead to higher numbers, one chain through all.
+
+    The last is the goal.
+    """
+    pairs = [
+        (i, j)
+        for i in range(nodes)
+        for j in range(i + 1, nodes)
+        if j == i + 1 or rng.random() < share
+    ]
     return PathProblem(np.array(pairs), rng.random((len(pairs), features)), nodes, nodes - 1)
 
 
@@ -45,7 +73,9 @@ def all_paths(problem: PathProblem, start: int) -> list[np.ndarray]:
         if path[-1] == problem.goal:
             found.append(np.array(path, np.int64))
         else:
-            unfinished += [[*path, int(to)] for to in problem.edges[problem.edges[:, 0] == path[-1], 1]]
+            unfinished += [
+                [*path, int(to)] for to in problem.edges[problem.edges[:, 0] == path[-1], 1]
+            ]
     return found
 
 
@@ -64,7 +94,9 @@ def demonstrations(count: int, weights: np.ndarray, seed: int = 0, **kwargs) -> 
     for _ in range(count):
         problem = grid(rng, **kwargs)
         start = int(rng.integers(problem.nodes // 2))
-        found.append(Demonstration(problem, cheapest_path(problem, plan(problem, weights), start)[0]))
+        found.append(
+            Demonstration(problem, cheapest_path(problem, plan(problem, weights), start)[0])
+        )
     return found
 
 

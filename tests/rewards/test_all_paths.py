@@ -1,4 +1,6 @@
-"""The distribution over all paths is what listing them, a linear system, and sampling from it say."""
+"""The distribution over all paths is what listing them, a linear system, and sampling from it
+say.
+"""
 
 import numpy as np
 import pytest
@@ -23,4 +25,6 @@ def test_drawn_paths_have_the_expected_features():
     problem, rng = grid(np.random.default_rng(3)), np.random.default_rng(0)
     planned = soft_plan(problem, 3 * WEIGHTS)
     drawn = np.array([problem.sums(draw(planned, 0, rng)) for _ in range(2_000)])
-    assert drawn.mean(axis=0) == pytest.approx(planned.features(0), abs=4 * drawn.std(axis=0).max() / np.sqrt(2_000))
+    assert drawn.mean(axis=0) == pytest.approx(
+        planned.features(0), abs=4 * drawn.std(axis=0).max() / np.sqrt(2_000)
+    )

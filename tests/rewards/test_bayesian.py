@@ -1,4 +1,6 @@
-"""The posterior: chains draw from the density they are given, and it knows what the demonstrations leave open."""
+"""The posterior: chains draw from the density they are given, and it knows what the
+demonstrations leave open.
+"""
 
 import numpy as np
 import pytest
@@ -19,7 +21,9 @@ def small_choices(rng: np.random.Generator) -> np.ndarray:
 
 
 def choose(sums: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The same sums (m, K) with one first that is drawn with probability proportional to exp(-cost)."""
+    """The same sums (m, K) with one first that is drawn with probability proportional to
+    exp(-cost).
+    """
     chances = np.exp((sums @ weights).min() - sums @ weights)
     one = int(rng.choice(len(sums), p=chances / chances.sum()))
     return np.concatenate([sums[[one]], np.delete(sums, one, axis=0)])

@@ -1,4 +1,6 @@
-"""Maximum entropy: its gradient is the likelihood's, and its solution has the demonstrations' features."""
+"""Maximum entropy: its gradient is the likelihood's, and its solution has the demonstrations'
+features.
+"""
 
 import numpy as np
 import pytest
@@ -15,7 +17,9 @@ def demonstrations(count: int, weights: np.ndarray = WEIGHTS, seed: int = 0) -> 
     rng, found = np.random.default_rng(seed), []
     for _ in range(count):
         problem = grid(rng)
-        found.append(Demonstration(problem, draw(soft_plan(problem, weights), int(rng.integers(20)), rng)))
+        found.append(
+            Demonstration(problem, draw(soft_plan(problem, weights), int(rng.integers(20)), rng))
+        )
     return found
 
 
@@ -27,7 +31,8 @@ def test_the_gradient_is_that_of_central_differences(prior):
         _, gradient = loss_of(shown, weights, prior)
         step = 1e-4
         differences = [
-            (loss_of(shown, weights + move, prior)[0] - loss_of(shown, weights - move, prior)[0]) / (2 * step)
+            (loss_of(shown, weights + move, prior)[0] - loss_of(shown, weights - move, prior)[0])
+            / (2 * step)
             for move in step * np.eye(3)
         ]
         assert np.abs(gradient - differences).max() / np.abs(gradient).max() <= 1e-6

@@ -15,7 +15,10 @@ def test_the_subgradient_is_the_slope():
     [shown] = demonstrations(1, TRUTH, **SIZE)
     weights, step = np.array([1.3, 0.6, 1.1]), 1e-6
     _, gradient = loss_of(shown, weights)
-    slopes = [(loss_of(shown, weights + move)[0] - loss_of(shown, weights - move)[0]) for move in step * np.eye(3)]
+    slopes = [
+        (loss_of(shown, weights + move)[0] - loss_of(shown, weights - move)[0])
+        for move in step * np.eye(3)
+    ]
     assert gradient == pytest.approx(np.array(slopes) / (2 * step), rel=1e-5, abs=1e-5)
 
 

@@ -1,4 +1,6 @@
-"""An arm of a user's own: one YAML and one MJCF, which brings a world of its own along as models from outside do."""
+"""An arm of a user's own: one YAML and one MJCF, which brings a world of its own along as models
+from outside do.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -76,7 +78,10 @@ _HINGES = """
   <geom type="capsule" size="0.008" fromto="0 0 0.01 0 0.02 0.08" mass="0.05"/>
 </body>
 """
-JAWS = {"slides": (_SLIDES, [0.0, 0.0], [0.045, 0.045]), "hinges": (_HINGES, [-0.2, -0.2], [0.6, 0.6])}
+JAWS = {
+    "slides": (_SLIDES, [0.0, 0.0], [0.045, 0.045]),
+    "hinges": (_HINGES, [-0.2, -0.2], [0.6, 0.6]),
+}
 
 
 def model_of(jaws: str = "slides") -> str:
@@ -93,12 +98,23 @@ def tree_of(jaws: str = "slides") -> dict[str, Any]:
         "home": [0.0, 0.377, 1.46, 1.3046, 0.0],
         "gains": [2000, 2000, 1500, 800, 500],
         "ee": {"body": "hand", "position": [0, 0, 0.09], "quaternion": [0, 0, 0, 1]},
-        "gripper": {"joints": ["left", "right"], "closed": closed, "open": opened, "fingers": ["left", "right"]},
+        "gripper": {
+            "joints": ["left", "right"],
+            "closed": closed,
+            "open": opened,
+            "fingers": ["left", "right"],
+        },
         "workspace": {"centre": [0.4, 0.0], "half_width": 0.12, "height": 0.1},
     }
 
 
-def write(folder: Path, name: str = "own", jaws: str = "slides", tree: Any = None, model: str | None = None) -> Path:
+def write(
+    folder: Path,
+    name: str = "own",
+    jaws: str = "slides",
+    tree: Any = None,
+    model: str | None = None,
+) -> Path:
     """Write YAML and model; returns the YAML's path."""
     (folder / "own.xml").write_text(model_of(jaws) if model is None else model)
     path = folder / f"{name}.yaml"

@@ -67,11 +67,14 @@ def test_a_scenes_actions_are_its_robots_joints_in_their_ranges(robot: str):
     assert actions.names == scene.robot.joint_names
     assert (actions.low < actions.high).all()
     np.testing.assert_allclose(
-        [actions.split(end)[1] for end in (actions.low, actions.high)], [gripper.least, gripper.most]
+        [actions.split(end)[1] for end in (actions.low, actions.high)],
+        [gripper.least, gripper.most],
     )
     home = actions.join(np.asarray(scene.robot.home), gripper.most)
     np.testing.assert_array_equal(actions.clip(home, 0), home)
     in_degrees = actions.units is not None
     step = np.degrees(scene.robot.max_joint_step) if in_degrees else scene.robot.max_joint_step
     assert (actions.scale[actions.arm] == step).all()
-    assert actions.scale[actions.gripper] == np.ptp([actions.low[actions.gripper], actions.high[actions.gripper]])
+    assert actions.scale[actions.gripper] == np.ptp(
+        [actions.low[actions.gripper], actions.high[actions.gripper]]
+    )

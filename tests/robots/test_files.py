@@ -22,7 +22,9 @@ def shaped(folder: Path, file: str, mesh: str, **more: Any) -> Robot:
     triangles = ["f 1 3 2", "f 1 2 4", "f 1 4 3", "f 2 3 4"]
     (folder / file).write_text("\n".join([*corners, *triangles]))
     model = MODEL.replace("</asset>", f'<mesh name="foot" file="{mesh}"/></asset>')
-    model = model.replace('<body name="base">', '<body name="base"><geom type="mesh" mesh="foot" contype="0"/>')
+    model = model.replace(
+        '<body name="base">', '<body name="base"><geom type="mesh" mesh="foot" contype="0"/>'
+    )
     for old, new in more.pop("text", {}).items():
         assert old in model
         model = model.replace(old, new)
@@ -46,10 +48,14 @@ def test_a_mesh_is_found_as_mujoco_finds_it(place: str, tmp_path: Path):
     assert arm_spec(shaped(tmp_path, file, mesh, **said)).compile().nmeshvert == 4
 
 
-def test_what_a_model_includes_is_found_where_the_yaml_says_and_what_lies_beside_it_does_not_matter(tmp_path: Path):
+def test_what_a_model_includes_is_found_where_the_yaml_says_and_what_lies_beside_it_does_not_matter(
+    tmp_path: Path,
+):
     parts = tmp_path / "parts"
     parts.mkdir()
-    (parts / "look.xml").write_text('<mujoco><asset><mesh name="foot" file="foot.obj"/></asset></mujoco>')
+    (parts / "look.xml").write_text(
+        '<mujoco><asset><mesh name="foot" file="foot.obj"/></asset></mujoco>'
+    )
     (parts / "LOOK.xml").write_text("what has the same name but for capitals")
     include = {'<mesh name="foot" file="foot.obj"/></asset>': '</asset><include file="look.xml"/>'}
     robot = shaped(tmp_path, "parts/foot.obj", "foot.obj", includes="parts", text=include)
@@ -67,8 +73,13 @@ def test_what_a_model_includes_is_found_where_the_yaml_says_and_what_lies_beside
 def with_shoe(folder: Path) -> Robot:
     """An arm whose model attaches another, with a mesh and with physics options of its own."""
     foot = '<asset><mesh name="foot" file="foot.obj"/></asset>'
-    body = '<worldbody><body name="shoe"><geom type="mesh" mesh="foot" contype="0"/></body></worldbody>'
-    (folder / "shoe.xml").write_text(f'<mujoco model="shoe"><option timestep="0.001"/>{foot}{body}</mujoco>')
+    body = (
+        '<worldbody><body name="shoe"><geom type="mesh" mesh="foot"'
+        ' contype="0"/></body></worldbody>'
+    )
+    (folder / "shoe.xml").write_text(
+        f'<mujoco model="shoe"><option timestep="0.001"/>{foot}{body}</mujoco>'
+    )
     attach = {
         "</asset>": '<model name="shoe" file="shoe.xml"/></asset>',
         '<body name="base">': '<body name="base"><attach model="shoe" body="shoe" prefix="own_"/>',
@@ -81,7 +92,10 @@ def test_a_model_that_is_attached_is_found_beside_the_one_that_attaches_it(tmp_p
 
 
 def test_a_conflict_of_attached_models_is_said_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    recwarn: pytest.WarningsRecorder,
 ):
     monkeypatch.chdir(tmp_path)
     _warn.cache_clear()

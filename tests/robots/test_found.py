@@ -32,7 +32,9 @@ def short(jaws: str = "slides", **said: Any) -> dict[str, Any]:
 
 @pytest.fixture(scope="module", params=list(JAWS))
 def path(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("found"), request.param, request.param, short(request.param))
+    return write(
+        tmp_path_factory.mktemp("found"), request.param, request.param, short(request.param)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +84,9 @@ def test_what_the_yaml_says_is_not_sought(tmp_path: Path):
 
 
 @pytest.mark.parametrize("stance", ['pos="0 0 0.8"', 'euler="0 0 3.14159"'], ids=["high", "turned"])
-def test_the_base_that_is_proposed_for_an_arm_out_of_reach_has_the_workspace_within_reach(stance: str, tmp_path: Path):
+def test_the_base_that_is_proposed_for_an_arm_out_of_reach_has_the_workspace_within_reach(
+    stance: str, tmp_path: Path
+):
     model = model_of().replace('<body name="base">', f'<body name="base" {stance}>')
     with pytest.raises(UsageError, match="try base: ") as refused:
         read_robot(write(tmp_path, tree=short(), model=model))
@@ -92,7 +96,9 @@ def test_the_base_that_is_proposed_for_an_arm_out_of_reach_has_the_workspace_wit
 
 def test_limits_of_motors_are_those_of_the_model(tmp_path: Path):
     weak = '<motor joint="turn" gear="50" ctrlrange="-1 1" ctrllimited="true"/>'
-    model = ARM.replace('<motor name="motor" joint="turn"/>', weak).replace("FINGERS", JAWS["slides"][0])
+    model = ARM.replace('<motor name="motor" joint="turn"/>', weak).replace(
+        "FINGERS", JAWS["slides"][0]
+    )
     assert get_robot(write(tmp_path, tree=short(), model=model)).forces[:2] == (50.0, 200.0)
 
 
@@ -106,7 +112,11 @@ def test_the_expert_drives_an_arm_of_a_short_yaml(path: Path, task: str):
 @pytest.mark.slow
 @every_example
 def test_an_example_says_little_and_is_found_whole(example: Path):
-    said = [line for line in example.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    said = [
+        line
+        for line in example.read_text().splitlines()
+        if line.strip() and not line.startswith("#")
+    ]
     assert len(said) <= 15
     robot = get_robot(example)
     opens = sweep(robot)
@@ -125,6 +135,8 @@ def test_the_expert_stacks_with_fingers_on_a_linkage(name: str):
     before, linked = env.data.qpos.copy(), sweep(env.scene.robot).linked
     assert linked
     env.advance(still(env, env.world.opening))
-    assert np.abs(env.data.qpos - before).max() < 0.01, "all joints of the linkage start where its opening says"
+    assert np.abs(env.data.qpos - before).max() < 0.01, (
+        "all joints of the linkage start where its opening says"
+    )
     episodes = list(RolloutJob(make_config(str(example), "stack")).run(SEEDS))
     assert all(episode.success for episode in episodes)

@@ -29,7 +29,9 @@ world_of = cache(world_at_home)
 
 
 def with_cube(robot: str, opening: float, offset: tuple[float, float, float]) -> World:
-    """At home, the cube between the fingers, off their middle by an offset in the hand's frame [m]."""
+    """At home, the cube between the fingers, off their middle by an offset in the hand's frame
+    [m].
+    """
     world, quat = world_of(robot), np.empty(4)
     gripper = world.scene.gripper
     world.data.qpos[gripper.q] = gripper.command(opening)
@@ -69,7 +71,9 @@ def test_the_measured_opening_is_the_gap_between_the_pads(robot: str):
         assert world.opening == pytest.approx(gap, abs=1e-3)
 
 
-def test_a_gap_that_stops_growing_is_refused_where_it_does_with_the_joints_that_nothing_drives(tmp_path: Path):
+def test_a_gap_that_stops_growing_is_refused_where_it_does_with_the_joints_that_nothing_drives(
+    tmp_path: Path,
+):
     tree = tree_of("hinges")
     tree["gripper"] |= {"joints": ["right"], "closed": [-0.2], "open": [2.8]}
     model = model_of("hinges").replace('range="-0.4 0.8"', 'range="-0.4 3"')
@@ -85,7 +89,9 @@ def test_a_gap_that_stops_growing_is_refused_where_it_does_with_the_joints_that_
 def test_a_command_is_measured_as_its_opening_within_what_there_is(robot: str, opening: float):
     gripper, qpos = world_of(robot).scene.gripper, world_of(robot).data.qpos.copy()
     qpos[gripper.q] = gripper.command(opening)
-    assert gripper.opening(qpos) == pytest.approx(np.clip(opening, gripper.least, gripper.most), abs=1e-9)
+    assert gripper.opening(qpos) == pytest.approx(
+        np.clip(opening, gripper.least, gripper.most), abs=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -101,12 +107,19 @@ def test_a_command_is_measured_as_its_opening_within_what_there_is(robot: str, o
     ],
 )
 @every_robot
-def test_the_cube_is_touched_by_all_fingers_or_not_at_all(robot: str, openings, offset, touched: bool):
+def test_the_cube_is_touched_by_all_fingers_or_not_at_all(
+    robot: str, openings, offset, touched: bool
+):
     for opening in openings:
         assert with_cube(robot, opening, offset).touched(OBJECT) == touched
 
 
-@given(st.sampled_from(sorted(ROBOTS)), st.floats(-0.008, 0.008), st.floats(-0.008, 0.008), st.floats(0.005, 0.02))
+@given(
+    st.sampled_from(sorted(ROBOTS)),
+    st.floats(-0.008, 0.008),
+    st.floats(-0.008, 0.008),
+    st.floats(0.005, 0.02),
+)
 def test_what_no_finger_is_near_is_never_touched(robot: str, x: float, z: float, beside: float):
     # The distance of two boxes that stand apart is now and then said to be none.
     room = world_of(robot).gripper.most - EDGE
@@ -121,5 +134,7 @@ def test_the_lowest_hand_keeps_its_fingers_off_the_table(robot: str):
     for opening in (gripper.least, gripper.most):
         world.data.qpos[gripper.q] = gripper.command(opening)
         world.update()
-        lowest = min(float(outline(world.model, world.data, geom)[:, 2].min()) for geom in gripper.geoms)
+        lowest = min(
+            float(outline(world.model, world.data, geom)[:, 2].min()) for geom in gripper.geoms
+        )
         assert lowest - (float(world.ee.position[2]) - world.robot.ee.lowest) > top + 1e-3

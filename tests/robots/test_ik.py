@@ -1,4 +1,6 @@
-"""Inverse kinematics solves the quadratic program that mink builds of its tasks and limits, bit for bit."""
+"""Inverse kinematics solves the quadratic program that mink builds of its tasks and limits, bit
+for bit.
+"""
 
 from typing import Any
 
@@ -17,7 +19,9 @@ from manip_il.robots.table import get_robot
 from ..tables import every_robot
 
 
-def problem_of_mink(robot: Robot, q: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> list[np.ndarray]:
+def problem_of_mink(
+    robot: Robot, q: np.ndarray, position: np.ndarray, rotation: np.ndarray
+) -> list[np.ndarray]:
     """Matrices and vectors of the program as mink's own tasks and limits make it."""
     model = arm_model(robot)
     configuration, home = mink.Configuration(model), np.zeros(model.nq)
@@ -48,7 +52,9 @@ def test_the_program_is_minks(robot: str, monkeypatch: pytest.MonkeyPatch):
 def compare(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     solved: list[Any] = []
     plain = daqp.solve
-    monkeypatch.setattr(ik.daqp, "solve", lambda *problem: solved.append(problem) or plain(*problem))
+    monkeypatch.setattr(
+        ik.daqp, "solve", lambda *problem: solved.append(problem) or plain(*problem)
+    )
     arm, rng = ArmIK(robot), np.random.default_rng(0)
     for _ in range(20):
         q = np.asarray(robot.home) + rng.uniform(-0.3, 0.3, len(robot.home))
@@ -56,12 +62,16 @@ def compare(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
         rotation = hand_down(rng.uniform(-1, 1))
         arm.ee_pose(q)
         assert arm.displacement(position, rotation, 0.1) is not None
-        for ours, theirs in zip(solved[-1], problem_of_mink(robot, q, position, rotation), strict=False):
+        for ours, theirs in zip(
+            solved[-1], problem_of_mink(robot, q, position, rotation), strict=False
+        ):
             np.testing.assert_array_equal(ours, theirs)
 
 
 def moves(robot: Robot, largest: float, rows: int = 40) -> tuple[np.ndarray, np.ndarray]:
-    """Joints (rows, arm) around home, and motions of the hand (rows, 6) up to so many [m] and, tripled, [rad]."""
+    """Joints (rows, arm) around home, and motions of the hand (rows, 6) up to so many [m] and,
+    tripled, [rad].
+    """
     arm, rng = ArmIK(robot), np.random.default_rng(1)
     q = np.asarray(robot.home) + rng.uniform(-0.5, 0.5, (rows, len(robot.home)))
     motions = rng.uniform(-largest, largest, (rows, 6)) * np.repeat([1.0, 3.0], 3)

@@ -1,4 +1,6 @@
-"""The map of where a hand gets to is made of solutions of inverse kinematics, worked out once and kept."""
+"""The map of where a hand gets to is made of solutions of inverse kinematics, worked out once
+and kept.
+"""
 
 import os
 from collections.abc import Callable
@@ -51,7 +53,9 @@ def test_a_place_is_reached_where_all_its_cell_is(share: tuple[float, ...]):
 
 
 @given(shares, st.integers(0, 2), st.floats(0.001, 3), st.booleans())
-def test_beyond_the_map_nothing_is_reached_and_the_error_grows(share, axis: int, beyond: float, above: bool):
+def test_beyond_the_map_nothing_is_reached_and_the_error_grows(
+    share, axis: int, beyond: float, above: bool
+):
     inside = within(share)
     inside[axis] = TOP[axis] if above else MAP.origin[axis]
     outside = inside.copy()
@@ -61,8 +65,12 @@ def test_beyond_the_map_nothing_is_reached_and_the_error_grows(share, axis: int,
     assert MAP.nearly(outside) == (MAP.error(outside) < STRETCH)
 
 
-def solve_from_home(ik: ArmIK, robot: Robot, position: np.ndarray, lean: float = 0.0) -> tuple[float, float]:
-    """How far the hand, told to point down, ends from a position [m], and from pointing down [rad]."""
+def solve_from_home(
+    ik: ArmIK, robot: Robot, position: np.ndarray, lean: float = 0.0
+) -> tuple[float, float]:
+    """How far the hand, told to point down, ends from a position [m], and from pointing down
+    [rad].
+    """
     q, down = np.asarray(robot.home, dtype=np.float64), hand_down(ik.ahead(position))
     for _ in range(120):
         ik.ee_pose(q)
@@ -115,7 +123,9 @@ def test_a_map_that_is_kept_is_what_would_be_worked_out_now(robot: str):
         point[2] = max(point[2], the_robot.ee.lowest)
         miss, q = reach._miss(the_robot, ik, point)
         blocked = miss < reach._BLOCKED and body.meets_itself(q)
-        assert there.errors[index] == pytest.approx(miss + (reach._BLOCKED if blocked else 0.0), abs=2e-3)
+        assert there.errors[index] == pytest.approx(
+            miss + (reach._BLOCKED if blocked else 0.0), abs=2e-3
+        )
 
 
 @every_robot
@@ -128,7 +138,10 @@ def test_a_robot_that_ships_has_its_map_beside_it(robot: str):
 
 @pytest.fixture
 def solved(monkeypatch, tmp_path: Path) -> list[str]:
-    """Names of the robots whose maps were worked out; what is kept lies in a folder of the test's own."""
+    """Names of the robots whose maps were worked out.
+
+    What is kept lies in a folder of the test's own.
+    """
     names: list[str] = []
 
     def solve(robot: Robot) -> Reach:
@@ -140,7 +153,9 @@ def solved(monkeypatch, tmp_path: Path) -> list[str]:
     return names
 
 
-def test_a_map_is_the_same_whether_it_is_worked_out_or_read(own: Robot, monkeypatch, tmp_path: Path):
+def test_a_map_is_the_same_whether_it_is_worked_out_or_read(
+    own: Robot, monkeypatch, tmp_path: Path
+):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(reach, "_BEYOND", -0.05)  # a map of a few points
     monkeypatch.setattr(reach, "_STEPS", 30)
@@ -157,7 +172,9 @@ def test_a_map_is_the_same_whether_it_is_worked_out_or_read(own: Robot, monkeypa
         (lambda text: text, 1),  # the same robot elsewhere
     ],
 )
-def test_another_model_has_a_map_of_its_own(change: Callable[[str], str], maps: int, solved: list[str], tmp_path: Path):
+def test_another_model_has_a_map_of_its_own(
+    change: Callable[[str], str], maps: int, solved: list[str], tmp_path: Path
+):
     for folder, text in ((tmp_path / "one", model_of()), (tmp_path / "other", change(model_of()))):
         folder.mkdir()
         read_again(get_robot(write(folder, model=text)))

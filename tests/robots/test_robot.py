@@ -40,7 +40,8 @@ def test_an_arm_from_a_yaml_is_a_scene_and_has_the_files_name(tmp_path: Path):
 
 
 def test_an_arm_from_a_yaml_is_driven_to_the_goal(tmp_path: Path, monkeypatch):
-    everywhere = Reach(np.array([-1.0, -1.0, 0.0]), np.zeros((41, 41, 21)))  # solving for its map takes long
+    # solving for its map takes long
+    everywhere = Reach(np.array([-1.0, -1.0, 0.0]), np.zeros((41, 41, 21)))
     monkeypatch.setattr(reach, "_solve", lambda robot: everywhere)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     env = started(str(write(tmp_path)), "reach", horizon=60)
@@ -60,7 +61,9 @@ def test_an_arm_of_ones_own_is_known_by_what_its_yaml_says(tmp_path: Path):
     for name, tree in trees.items():
         (tmp_path / name).mkdir()
         write(tmp_path / name, tree=tree)
-    one, same, other = (env_fingerprint(make_config(str(tmp_path / name / "own.yaml"), "reach")) for name in trees)
+    one, same, other = (
+        env_fingerprint(make_config(str(tmp_path / name / "own.yaml"), "reach")) for name in trees
+    )
     assert one == same
     assert {key for key in one if one[key] != other[key]} == {"robot_sha256"}
 
@@ -93,7 +96,10 @@ MISTAKES = {
         but(joints=["turn", "shoulder", "elbwo", "wrist", "roll"]),
         ["unknown joint", "own", "'elbwo'", "did you mean 'elbow'", "known: elbow, left"],
     ),
-    "opened the wrong way round": (inside("gripper", closed=[0.045] * 2, open=[0.0] * 2), ["the fingers stand"]),
+    "opened the wrong way round": (
+        inside("gripper", closed=[0.045] * 2, open=[0.0] * 2),
+        ["the fingers stand"],
+    ),
     "a package that is not installed": (
         but(model="no_such_arms:arm.xml"),
         ["model is in 'no_such_arms'", "not installed", "pip install --no-deps no-such-arms"],
@@ -108,13 +114,16 @@ def test_a_mistake_in_the_yaml_is_one_line(mistake: str, tmp_path: Path):
     line = refusal(path)
     for word in words:
         assert word in line
-    assert str(path) in line or "robot own" in line  # the one where the YAML is read, the other where the model is
+    # the one where the YAML is read, the other where the model is
+    assert str(path) in line or "robot own" in line
 
 
 def test_a_gripper_too_small_for_the_tasks_cube_is_one_line(tmp_path: Path):
     path = write(tmp_path, tree=inside("gripper", open=[0.02, 0.02]))
     line = refusal(path, "pick_place")
-    assert "task pick_place: 'object' is 0.050 m wide, and the gripper of own opens to 0.042 m" in line
+    assert (
+        "task pick_place: 'object' is 0.050 m wide, and the gripper of own opens to 0.042 m" in line
+    )
     assert scene_of(path, "reach").gripper.most < 0.05
 
 
@@ -124,7 +133,9 @@ def test_nothing_that_belongs_to_a_world_is_left_of_a_model(own: Robot):
         assert list(getattr(spec, kind)) == [], kind
     assert [site.name for site in spec.sites] == ["ee"]
     assert not any(body.mocap for body in spec.bodies)
-    assert sorted(motor.name for motor in spec.actuators) == sorted([*own.joints, *own.gripper.joints])
+    assert sorted(motor.name for motor in spec.actuators) == sorted(
+        [*own.joints, *own.gripper.joints]
+    )
     model = spec.compile()
     assert (model.opt.timestep, model.opt.gravity[2]) == (0.002, -9.81)
     assert [material.name for material in spec.materials] == ["steel"]
@@ -134,11 +145,19 @@ def test_nothing_that_belongs_to_a_world_is_left_of_a_model(own: Robot):
 def test_a_scene_has_the_worlds_cameras_lamps_and_sky_alone(robot: str):
     scene = scene_of(robot, "reach")
     model = scene.model
-    assert sorted(model.camera(i).name for i in range(model.ncam)) == ["front", f"{PREFIX}wrist", "side"]
+    assert sorted(model.camera(i).name for i in range(model.ncam)) == [
+        "front",
+        f"{PREFIX}wrist",
+        "side",
+    ]
     assert all(model.light_bodyid == 0)
     assert model.nsensor == model.nkey == 0
-    assert [model.body(i).name for i in range(model.nbody) if model.body_mocapid[i] >= 0] == ["goal"]
-    skies = [i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX]
+    assert [model.body(i).name for i in range(model.nbody) if model.body_mocapid[i] >= 0] == [
+        "goal"
+    ]
+    skies = [
+        i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX
+    ]
     assert [model.texture(i).name for i in skies] == ["sky"]
     driven = {model.joint(int(model.actuator_trnid[i, 0])).name for i in range(model.nu)}
     assert driven == {PREFIX + name for name in (*scene.robot.joints, *scene.robot.gripper.joints)}
@@ -146,7 +165,10 @@ def test_a_scene_has_the_worlds_cameras_lamps_and_sky_alone(robot: str):
 
 
 def test_a_base_moves_the_robot(tmp_path: Path):
-    plain, moved = write(tmp_path, "plain"), write(tmp_path, "moved", tree=tree_of() | {"base": [0.1, 0.2, -0.3]})
+    plain, moved = (
+        write(tmp_path, "plain"),
+        write(tmp_path, "moved", tree=tree_of() | {"base": [0.1, 0.2, -0.3]}),
+    )
     ees = [ArmIK(get_robot(path)).ee_pose(np.zeros(5))[0] for path in (plain, moved)]
     np.testing.assert_allclose(ees[1] - ees[0], [0.1, 0.2, -0.3], atol=1e-9)
 
@@ -176,7 +198,8 @@ def test_the_fingers_move_along_the_hands_y(robot: str):
 @every_robot
 def test_the_arm_alone_stands_where_the_scenes_arm_does(robot: str):
     world, model, rng = world_at_home(robot), arm_model(get_robot(robot)), np.random.default_rng(0)
-    assert [model.joint(i).name for i in range(model.njnt)] == list(world.scene.robot.joints)  # and no others
+    # and no others
+    assert [model.joint(i).name for i in range(model.njnt)] == list(world.scene.robot.joints)
     assert model.nu == 0
     alone, home = ArmIK(world.scene.robot), np.asarray(world.scene.robot.home)
     for _ in range(5):

@@ -1,4 +1,6 @@
-"""SO-101 speaks as the real one does in LeRobot: its names, degrees, 0 to 100, 30 frames a second."""
+"""SO-101 speaks as the real one does in LeRobot: its names, degrees, 0 to 100, 30 frames a
+second.
+"""
 
 from typing import Any
 
@@ -40,10 +42,16 @@ def stand(real: Any, env: ManipEnv) -> None:
 
 
 def test_features_are_those_that_lerobots_recorder_makes(real):
-    spec = env_spec(make_config("so101", "pick_place", object="box:0.025"), CameraConfig(("front",), 48, 64))
+    spec = env_spec(
+        make_config("so101", "pick_place", object="box:0.025"), CameraConfig(("front",), 48, 64)
+    )
     ours, theirs = features(spec), recorders_features(real)
     for key, feature in theirs.items():
-        assert {**ours[key], "info": None} == {**feature, "shape": tuple(feature["shape"]), "info": None}, key
+        assert {**ours[key], "info": None} == {
+            **feature,
+            "shape": tuple(feature["shape"]),
+            "info": None,
+        }, key
     assert list(theirs) == [ACTION, STATE, "observation.images.front"]
     assert (spec.robot_type, spec.robot, spec.fps) == (real.name, "so101", 30)
 
@@ -70,7 +78,9 @@ def test_the_real_arm_goes_where_an_action_sends_the_simulated_one(real):
         joints, opening = actions.split(action)
         wanted = [*joints, *scene_of("so101", "reach").gripper.command(opening)]
         steps = [real.bus.steps[name] for name in limits()]
-        np.testing.assert_allclose((np.array(steps) - 2047.5) * 360 / 4096, np.degrees(wanted), atol=2 * STEP)
+        np.testing.assert_allclose(
+            (np.array(steps) - 2047.5) * 360 / 4096, np.degrees(wanted), atol=2 * STEP
+        )
 
 
 def test_units_there_and_back_are_the_same_joints_and_opening():
@@ -83,13 +93,24 @@ def test_units_there_and_back_are_the_same_joints_and_opening():
         assert again == pytest.approx(opening, abs=1e-9)
     closed = actions.join(np.zeros(5), gripper.least)
     assert closed[-1] == 0
-    assert actions.join(np.zeros(5), gripper.most)[-1] == pytest.approx(100 * (1.2 + 0.1745) / 1.9199)
-    assert actions.clip(np.full(6, 100.0), 0)[-1] == actions.high[-1]  # the simulated jaw opens to 72
+    assert actions.join(np.zeros(5), gripper.most)[-1] == pytest.approx(
+        100 * (1.2 + 0.1745) / 1.9199
+    )
+    # the simulated jaw opens to 72
+    assert actions.clip(np.full(6, 100.0), 0)[-1] == actions.high[-1]
 
 
 def test_robots_with_a_name_of_lerobots_are_known_by_it():
-    named = {one.lerobot.robot_type: name for name in ROBOTS if (one := get_robot(name)).lerobot is not None}
+    named = {
+        one.lerobot.robot_type: name
+        for name in ROBOTS
+        if (one := get_robot(name)).lerobot is not None
+    }
     assert named == LEROBOT_TYPES
-    assert {name: make_config(name).control_hz for name in ROBOTS} == {"panda": 20, "fetch": 20, "so101": 30}
+    assert {name: make_config(name).control_hz for name in ROBOTS} == {
+        "panda": 20,
+        "fetch": 20,
+        "so101": 30,
+    }
     assert env_spec(make_config("so101", "reach")).action_meaning == SERVOS
     assert ManipILEnv(task="Reach-v0", robot="so101").fps == 30

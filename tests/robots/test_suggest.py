@@ -41,7 +41,9 @@ def test_one_jaw_that_moves_has_the_hand_for_the_other():
 def test_a_gripper_of_its_own_goes_onto_the_last_body(tmp_path: Path):
     arm, gripper = model_in(tmp_path, "slides"), tmp_path / "gripper.xml"
     arm.write_text(ARM.replace("FINGERS", '<body name="flange"><geom size="0.01"/></body>'))
-    gripper.write_text(f'<mujoco><worldbody><body name="palm">{JAWS["slides"][0]}</body></worldbody></mujoco>')
+    gripper.write_text(
+        f'<mujoco><worldbody><body name="palm">{JAWS["slides"][0]}</body></worldbody></mujoco>'
+    )
     found = suggest(arm, gripper)
     assert found["hand"] == "flange"
     assert set(found["gripper"]["joints"]) == {"left", "right"}
@@ -72,13 +74,18 @@ def test_a_piece_of_a_model_is_called_a_fragment(piece: str, tmp_path: Path):
 def with_gripper(folder: Path, quat: str) -> list[str]:
     """The words that make a YAML for an arm and a gripper's model, whose palm is turned."""
     flange = '<body name="flange" pos="0 0 0.02"><geom size="0.01"/></body>'
-    palm = f'<body name="palm" quat="{quat}"><geom size="0.02 0.06 0.01" type="box"/>{JAWS["slides"][0]}</body>'
+    palm = (
+        f'<body name="palm" quat="{quat}"><geom size="0.02 0.06 0.01"'
+        f' type="box"/>{JAWS["slides"][0]}</body>'
+    )
     (folder / "arm.xml").write_text(ARM.replace("FINGERS", flange))
     (folder / "gripper.xml").write_text(f"<mujoco><worldbody>{palm}</worldbody></mujoco>")
     return ["robot", "new", str(folder / "arm.xml"), f"--gripper={folder / 'gripper.xml'}"]
 
 
-def test_a_hand_put_on_sideways_is_written_without_success_and_the_remedy_named(tmp_path: Path, capsys):
+def test_a_hand_put_on_sideways_is_written_without_success_and_the_remedy_named(
+    tmp_path: Path, capsys
+):
     assert main(with_gripper(tmp_path, "0.7071 0.7071 0 0")) == 2
     out, err = capsys.readouterr()
     assert out == f"robot: {tmp_path / 'arm.yaml'}\n"

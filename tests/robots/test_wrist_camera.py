@@ -29,7 +29,9 @@ def bodies_seen(world: World, camera: int) -> np.ndarray:
     rays = rays @ data.cam_xmat[camera].reshape(3, 3).T
     geoms, distances = np.empty(len(rays), np.int32), np.empty(len(rays))
     where, farthest = data.cam_xpos[camera], 10.0
-    mujoco.mj_multiRay(model, data, where, rays.ravel(), SHOWN, 1, -1, geoms, distances, None, len(rays), farthest)
+    mujoco.mj_multiRay(
+        model, data, where, rays.ravel(), SHOWN, 1, -1, geoms, distances, None, len(rays), farthest
+    )
     return np.where(geoms >= 0, model.geom_bodyid[geoms], -1)
 
 
@@ -54,4 +56,6 @@ def test_both_fingers_are_in_view(robot: str | Path):
         mujoco.mj_step(scene.model, data, SETTLE)
         seen = [owner(world, body) for body in bodies_seen(world, camera_id(scene.model, "wrist"))]
         for finger in scene.robot.gripper.fingers:
-            assert seen.count(finger) > LEAST * len(seen), f"{finger}, with the hand open by {opening:.3f} m"
+            assert seen.count(finger) > LEAST * len(seen), (
+                f"{finger}, with the hand open by {opening:.3f} m"
+            )

@@ -14,7 +14,8 @@ from manip_il.serve.bus import STEP, Bus, Calibration, encoder_steps
 BROADCAST = 0xFE
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x82, 0x83
 KEPT: Calibration = {
-    f"joint_{number}": {"id": number, "homing_offset": 0, "range_min": 800, "range_max": 3300} for number in range(1, 7)
+    f"joint_{number}": {"id": number, "homing_offset": 0, "range_min": 800, "range_max": 3300}
+    for number in range(1, 7)
 }
 CENTRE = np.zeros(6)  # where encoders read 2048 [rad]
 
@@ -35,11 +36,15 @@ def bus() -> Iterator[Bus]:
 def test_a_negative_number_is_sign_and_magnitude(bus: Bus, value: int):
     bus["Homing_Offset"] = value
     assert (bus["Homing_Offset"] == value).all()
-    assert int.from_bytes(bus.memory[0, 31:33], "little") == abs(value) | (0x800 if value < 0 else 0)
+    assert int.from_bytes(bus.memory[0, 31:33], "little") == abs(value) | (
+        0x800 if value < 0 else 0
+    )
 
 
 def test_every_servo_answers_a_broadcast_and_an_absent_one_nothing(bus: Bus):
-    assert bus.feed(packet(BROADCAST, PING)) == b"".join(packet(number, 0) for number in range(1, 7))
+    assert bus.feed(packet(BROADCAST, PING)) == b"".join(
+        packet(number, 0) for number in range(1, 7)
+    )
     assert bus.feed(packet(3, PING)) == packet(3, 0)
     assert bus.feed(packet(9, PING)) == b""
 
@@ -64,7 +69,9 @@ def test_a_goal_stays_within_the_limits(bus: Bus):
 def test_sync_write_tells_several_servos_at_once_and_sync_read_asks_them(bus: Bus):
     assert bus.feed(packet(BROADCAST, SYNC_WRITE, 42, 2, 1, 0x10, 0x08, 2, 0x20, 0x08)) == b""
     assert bus.goals()[:2] == pytest.approx([16 * STEP, 32 * STEP])
-    assert bus.feed(packet(BROADCAST, SYNC_READ, 42, 2, 2, 1)) == packet(2, 0, 0x20, 0x08) + packet(1, 0, 0x10, 0x08)
+    assert bus.feed(packet(BROADCAST, SYNC_READ, 42, 2, 2, 1)) == packet(2, 0, 0x20, 0x08) + packet(
+        1, 0, 0x10, 0x08
+    )
 
 
 def test_what_a_servo_measures_cannot_be_written(bus: Bus):
@@ -96,11 +103,14 @@ def test_a_client_that_asks_without_reading_does_not_keep_the_port_open():
 
 
 def test_garbage_is_not_answered_and_what_follows_is(bus: Bus):
-    """Noise, halves of packets, wrong checksums, 10,000 times: only whole right ones are answered, in the end all."""
+    """Noise, halves of packets, wrong checksums, 10,000 times: only whole right ones are
+    answered, in the end all.
+    """
     asked, rng = packet(1, READ, 3, 2), np.random.default_rng(0)
     right = packet(1, 0, 777 & 0xFF, 777 >> 8)
     for _ in range(10_000):
-        noise = rng.integers(0, 255, rng.integers(0, 24), dtype=np.uint8).tobytes()  # no 255: no head of a packet
+        # no 255: no head of a packet
+        noise = rng.integers(0, 255, rng.integers(0, 24), dtype=np.uint8).tobytes()
         wrong = asked[:-1] + bytes([asked[-1] ^ int(rng.integers(1, 256))])
         half = asked[: int(rng.integers(0, len(asked)))]
         found = b"".join(bus.feed(part) for part in (noise, wrong, half, asked * 4))

@@ -1,4 +1,6 @@
-"""LeRobot's own programs, unmodified, run to their end against the arm: their keys are pressed for them."""
+"""LeRobot's own programs, unmodified, run to their end against the arm: their keys are pressed
+for them.
+"""
 
 import json
 import shutil
@@ -25,27 +27,58 @@ from manip_il.worlds.table import make_config
 pytestmark = pytest.mark.slow
 Run = Callable[..., list[Episode]]
 _TRIES = 3
-_UNANSWERED = ("There is no status packet", "motor check failed", "Could not connect")  # LeRobot waits 50 ms alone
+# LeRobot waits 50 ms alone
+_UNANSWERED = ("There is no status packet", "motor check failed", "Could not connect")
 
 
 @pytest.fixture
 def run(tmp_path: Path, start: Callable[..., ForkServerProcess]) -> Run:
-    """Runs a program against `lift`, served by a process of its own; returns what was logged. arms: that it opens."""
+    """Runs a program against `lift`, served by a process of its own.
 
-    def run(program: str, *words: str, arms: str = "follower leader", served: tuple[str, ...] = ()) -> list[Episode]:
+    Returns what was logged. arms: that it opens.
+    """
+
+    def run(
+        program: str, *words: str, arms: str = "follower leader", served: tuple[str, ...] = ()
+    ) -> list[Episode]:
         root, path = tmp_path / "arm", Path(sys.executable).with_name(program)
-        robot = ["--robot.type=so101_follower", f"--robot.port={root}/follower", "--robot.id=follower"]
-        teleop = ["--teleop.type=so101_leader", f"--teleop.port={root}/leader", "--teleop.id=leader"]
-        robot, teleop = [*robot, f"--robot.calibration_dir={root}"], [*teleop, f"--teleop.calibration_dir={root}"]
-        options = [*(robot if "follower" in arms else []), *(teleop if "leader" in arms else []), *words]
-        own = ["serve", "--task.type=lift", f"--output_dir={root}", f"--log={tmp_path}/log", *served]
+        robot = [
+            "--robot.type=so101_follower",
+            f"--robot.port={root}/follower",
+            "--robot.id=follower",
+        ]
+        teleop = [
+            "--teleop.type=so101_leader",
+            f"--teleop.port={root}/leader",
+            "--teleop.id=leader",
+        ]
+        robot, teleop = (
+            [*robot, f"--robot.calibration_dir={root}"],
+            [*teleop, f"--teleop.calibration_dir={root}"],
+        )
+        options = [
+            *(robot if "follower" in arms else []),
+            *(teleop if "leader" in arms else []),
+            *words,
+        ]
+        own = [
+            "serve",
+            "--task.type=lift",
+            f"--output_dir={root}",
+            f"--log={tmp_path}/log",
+            *served,
+        ]
         code, said, tries = 1, _UNANSWERED[0], 0
         while code != 0 and any(one in said for one in _UNANSWERED) and tries < _TRIES:
             for old in (folder for folder in tmp_path.iterdir() if folder.name != "arm"):
                 shutil.rmtree(old) if old.is_dir() else old.unlink()
             served_by = start(*own, "--", str(path), *options, log=tmp_path / "said")
             served_by.join()
-            code, said, tries = served_by.exitcode, (tmp_path / "said").read_text(errors="replace"), tries + 1
+            code, said, tries = (
+                served_by.exitcode,
+                (tmp_path / "said").read_text(errors="replace"),
+                tries + 1,
+            )
         assert code == 0, said[-3000:]
         return [read_journal(path)[1] for path in list_episodes(tmp_path / "log")]
 
@@ -54,8 +87,16 @@ def run(tmp_path: Path, start: Callable[..., ForkServerProcess]) -> Run:
 
 def dataset(folder: Path, name: str, episodes: int) -> list[str]:
     """Options of the dataset that a program is to write."""
-    options = {"repo_id": f"local/{name}", "root": str(folder / name), "single_task": "lift", "push_to_hub": "false"}
-    return [*(f"--dataset.{key}={value}" for key, value in options.items()), f"--dataset.num_episodes={episodes}"]
+    options = {
+        "repo_id": f"local/{name}",
+        "root": str(folder / name),
+        "single_task": "lift",
+        "push_to_hub": "false",
+    }
+    return [
+        *(f"--dataset.{key}={value}" for key, value in options.items()),
+        f"--dataset.num_episodes={episodes}",
+    ]
 
 
 def test_record_keeps_solved_episodes_with_the_frames_of_the_log(run: Run, tmp_path: Path):
@@ -65,10 +106,12 @@ def test_record_keeps_solved_episodes_with_the_frames_of_the_log(run: Run, tmp_p
     assert recorded.num_episodes == len(logged) == 2
     assert all(episode.success for episode in logged)
     first = np.stack(recorded.hf_dataset["observation.state"])[0]
-    assert np.abs(first - logged[0].columns["observation.state"][0]).max() < 0.2  # a step of the encoder
+    # a step of the encoder
+    assert np.abs(first - logged[0].columns["observation.state"][0]).max() < 0.2
     assert abs(len(recorded) - sum(map(len, logged))) <= 2
     assert main(["data", "build", f"{tmp_path}/log", f"{tmp_path}/ours"]) == 0
-    assert Dataset.open(tmp_path / "ours").provenance["driver"] == SERVED  # redrawn labels then hold the servos' sag
+    # redrawn labels then hold the servos' sag
+    assert Dataset.open(tmp_path / "ours").provenance["driver"] == SERVED
 
 
 def test_teleoperate_follows_the_expert_from_world_to_world(run: Run):
@@ -82,13 +125,18 @@ def ends(folder: Path) -> NDArray[np.int64]:
     """The ends of every joint of a calibrated follower, in steps of its encoder, (n, 2)."""
     kept = json.loads((folder / "arm" / "follower.json").read_text())
     return np.array(
-        [[one["range_min"], one["range_max"]] + one["homing_offset"] * np.ones(2, int) for one in kept.values()]
+        [
+            [one["range_min"], one["range_max"]] + one["homing_offset"] * np.ones(2, int)
+            for one in kept.values()
+        ]
     )
 
 
 def test_an_arm_is_calibrated(run: Run, tmp_path: Path):
     """The calibration that is found is the model's, to within two steps; the servos keep it."""
-    Station(env_of(make_config("so101", "lift")), SessionConfig(output_dir=tmp_path / "model" / "arm")).close()
+    Station(
+        env_of(make_config("so101", "lift")), SessionConfig(output_dir=tmp_path / "model" / "arm")
+    ).close()
     model = ends(tmp_path / "model")
     run("lerobot-calibrate", arms="follower")
     assert "Calibration saved" in (tmp_path / "said").read_text()
@@ -101,15 +149,27 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("policy")
     size = ["--cameras=front", "--image.height=32", "--image.width=32"]
     env = ["--robot.type=so101", "--task.type=lift", "--workers=1"]
-    assert main(["record", *env, *size, "--dataset.num_episodes=2", f"--dataset.root={folder}/data"]) == 0
-    fit = ["--policy.type=cnn", "--policy.channels=[4,4]", "--policy.keypoints=4", "--policy.width=16", "--steps=2"]
+    assert (
+        main(["record", *env, *size, "--dataset.num_episodes=2", f"--dataset.root={folder}/data"])
+        == 0
+    )
+    fit = [
+        "--policy.type=cnn",
+        "--policy.channels=[4,4]",
+        "--policy.keypoints=4",
+        "--policy.width=16",
+        "--steps=2",
+    ]
     assert main(["train", f"--dataset.root={folder}/data", *fit, f"--output_dir={folder}/run"]) == 0
     return f"{folder}/run/checkpoints/last/pretrained_model"
 
 
 def rollout(policy: str, port: int, strategy: str) -> list[str]:
     """Options of `lerobot-rollout`."""
-    camera = f"type: zmq, server_address: 127.0.0.1, port: {port}, camera_name: front, width: 32, height: 32, fps: 30"
+    camera = (
+        f"type: zmq, server_address: 127.0.0.1, port: {port}, camera_name: front, width: 32,"
+        " height: 32, fps: 30"
+    )
     return [
         "--env.discover_packages_path=manip_il.lerobot_plugin",
         f"--policy.path={policy}",
@@ -141,14 +201,20 @@ def test_a_policy_at_the_leader_drives_whoever_follows_it(run: Run, policy: str)
 def test_episodic_rollout_keeps_what_is_not_solved(run: Run, policy: str, tmp_path: Path):
     words = [*rollout(policy, 5632, "episodic"), *dataset(tmp_path, "rollout_t", 2)]
     logged = run("lerobot-rollout", *words, arms="follower", served=pictures(5632, 30))
-    assert LeRobotDataset("local/rollout_t", root=tmp_path / "rollout_t").num_episodes == len(logged) == 2
+    assert (
+        LeRobotDataset("local/rollout_t", root=tmp_path / "rollout_t").num_episodes
+        == len(logged)
+        == 2
+    )
     assert not any(episode.success for episode in logged)
     assert {*np.concatenate([one.columns["actor"] for one in logged]).ravel()} == {Actor.LEARNER}
 
 
 @pytest.mark.gl
 def test_dagger_corrects_a_policy_that_gets_nowhere(run: Run, policy: str, tmp_path: Path):
-    """LeRobot's dataset holds the correction alone, the log the whole attempt, labelled in every frame."""
+    """LeRobot's dataset holds the correction alone, the log the whole attempt, labelled in every
+    frame.
+    """
     words = [*rollout(policy, 5633, "dagger"), *dataset(tmp_path, "rollout_t", 1)]
     logged = run("lerobot-rollout", *words, served=pictures(5633, 75))
     actors = logged[0].columns["actor"].ravel()

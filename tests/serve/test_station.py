@@ -1,4 +1,6 @@
-"""A simulated arm behind its ports: LeRobot's own drivers, unmodified, and what the world does meanwhile."""
+"""A simulated arm behind its ports: LeRobot's own drivers, unmodified, and what the world does
+meanwhile.
+"""
 
 import signal
 import subprocess
@@ -26,7 +28,9 @@ from ..cli.made_runs import files
 
 
 def station_of(folder: Path, servo: str = "sts3215", robot: str = "so101") -> Station:
-    station = Station(env_of(make_config(robot, "lift")), SessionConfig(output_dir=folder, servo=servo))
+    station = Station(
+        env_of(make_config(robot, "lift")), SessionConfig(output_dir=folder, servo=servo)
+    )
     station.reset(1)
     return station
 
@@ -96,7 +100,9 @@ def test_a_lower_gain_sags_more(station: Station):
     assert np.abs(station.follower.sag()).max() == pytest.approx(2 * sag)
 
 
-def test_the_weight_of_a_session_is_raised_and_given_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_weight_of_a_session_is_raised_and_given_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """On systems that do not weigh sessions the file is empty or missing."""
     group = tmp_path / "autogroup"
     monkeypatch.setattr(operator, "_AUTOGROUP", group)
@@ -165,11 +171,15 @@ def served(tmp_path_factory) -> Iterator[Path]:
 
 @pytest.mark.slow
 def test_lerobots_own_drivers_open_it(served: Path):
-    """Their calibration fits, a target moves the arm, and a leader with torque is moved by what it is told."""
+    """Their calibration fits, a target moves the arm, and a leader with torque is moved by what
+    it is told.
+    """
     follower = SO101Follower(
         SOFollowerRobotConfig(port=str(served / "follower"), id="follower", calibration_dir=served)
     )
-    leader = SO101Leader(SOLeaderTeleopConfig(port=str(served / "leader"), id="leader", calibration_dir=served))
+    leader = SO101Leader(
+        SOLeaderTeleopConfig(port=str(served / "leader"), id="leader", calibration_dir=served)
+    )
     follower.connect(calibrate=False)
     leader.connect(calibrate=False)
     assert follower.is_calibrated
@@ -179,7 +189,9 @@ def test_lerobots_own_drivers_open_it(served: Path):
     for _ in range(40):
         follower.send_action(target)
         time.sleep(1 / 30)
-    assert follower.get_observation()["shoulder_pan.pos"] == pytest.approx(target["shoulder_pan.pos"], abs=1)
+    assert follower.get_observation()["shoulder_pan.pos"] == pytest.approx(
+        target["shoulder_pan.pos"], abs=1
+    )
     leader.enable_torque()
     leader.send_feedback({**leader.get_action(), "wrist_flex.pos": 40.0})
     time.sleep(2.0)

@@ -11,7 +11,12 @@ from manip_il.sim.shape import KINDS
 KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), action_noise=(0.1, 0.1))
 OBJECT = Condition("object", mass=(0.05, 0.3), size=(0.04, 0.06), colour=(0.1, 0.9))
 VIEW = Condition(
-    "view", camera_shift=(0.01, 0.05), camera_turn=(0, 5), brightness=(0.6, 1.4), light_turn=(-60, 60), table=(0.2, 0.9)
+    "view",
+    camera_shift=(0.01, 0.05),
+    camera_turn=(0, 5),
+    brightness=(0.6, 1.4),
+    light_turn=(-60, 60),
+    table=(0.2, 0.9),
 )
 
 
@@ -44,7 +49,9 @@ def test_what_nobody_notices_is_left_out():
         "mass": (0.05, 0.3),
         "size": (0.04, 0.06),
     }
-    assert KNOCKED.for_world(has_object=False, sees=False, sizes=(0.03, 0.07)).ranges == {"action_noise": (0.1, 0.1)}
+    assert KNOCKED.for_world(has_object=False, sees=False, sizes=(0.03, 0.07)).ranges == {
+        "action_noise": (0.1, 0.1)
+    }
     assert NOMINAL.for_world(has_object=False, sees=False, sizes=(0.03, 0.07)) == NOMINAL
     assert VIEW.for_world(has_object=False, sees=True, sizes=(0.03, 0.07)) == VIEW
 
@@ -57,9 +64,14 @@ def test_an_object_of_any_shape_has_one_of_all_shapes():
 
 
 def test_sizes_are_those_that_a_task_can_take():
-    assert OBJECT.for_world(has_object=True, sees=False, sizes=(0.05, 0.08)).ranges["size"] == (0.05, 0.06)
+    assert OBJECT.for_world(has_object=True, sees=False, sizes=(0.05, 0.08)).ranges["size"] == (
+        0.05,
+        0.06,
+    )
     assert "size" not in OBJECT.for_world(has_object=True, sees=True, sizes=None).ranges
-    with pytest.raises(UsageError, match=r"size is 0[.]04 to 0[.]06 m, and the task takes objects of 0[.]01 to"):
+    with pytest.raises(
+        UsageError, match=r"size is 0[.]04 to 0[.]06 m, and the task takes objects of 0[.]01 to"
+    ):
         OBJECT.for_world(has_object=True, sees=True, sizes=(0.01, 0.03))
 
 

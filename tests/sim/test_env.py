@@ -30,7 +30,9 @@ def random_actions(env: ManipEnv, count: int) -> np.ndarray:
     return still(env) + np.random.default_rng(0).uniform(-0.1, 0.1, (count, len(still(env))))
 
 
-def trajectory(env: ManipEnv, actions: np.ndarray) -> list[tuple[bytes, bytes, bytes, float, float]]:
+def trajectory(
+    env: ManipEnv, actions: np.ndarray
+) -> list[tuple[bytes, bytes, bytes, float, float]]:
     """The state, what is observed and how far the task is, as it is and after every action."""
     seen = []
     for step in range(len(actions) + 1):
@@ -43,7 +45,8 @@ def trajectory(env: ManipEnv, actions: np.ndarray) -> list[tuple[bytes, bytes, b
 
 
 @every_task
-@pytest.mark.filterwarnings("ignore:.*(infinity|normalized space).*:UserWarning")  # an observation has no bounds
+# an observation has no bounds
+@pytest.mark.filterwarnings("ignore:.*(infinity|normalized space).*:UserWarning")
 def test_gymnasium_takes_it_for_its_own(task: str):
     check_env(make_env("panda", task), skip_render_check=True)
 
@@ -93,7 +96,9 @@ def test_another_seed_is_another_start_and_reset_starts_with_its_own():
     ],
 )
 @every_robot
-def test_an_action_that_is_refused_changes_nothing(robot: str, wrong, error: type[ManipError], words: str):
+def test_an_action_that_is_refused_changes_nothing(
+    robot: str, wrong, error: type[ManipError], words: str
+):
     env = started(robot, "reach")
     before = bits(env)
     with pytest.raises(error, match=words):
@@ -124,7 +129,9 @@ def test_success_is_so_many_steps_in_a_row(success_steps: int):
     move_goal(env, here)
     seen = [env.step(still(env))[4] for _ in range(success_steps + 1)]
     solved = [False] * (success_steps - 1) + [True, True]
-    assert [info["is_success"] for info in seen] == [info["ever_success"] for info in seen] == solved
+    assert (
+        [info["is_success"] for info in seen] == [info["ever_success"] for info in seen] == solved
+    )
     move_goal(env, here + [0, 0, 0.1])
     info = env.step(still(env))[4]
     assert (info["is_success"], info["ever_success"]) == (False, True)

@@ -1,4 +1,6 @@
-"""Environments under conditions: physics has the drawn cube, observations and pictures what was drawn for them."""
+"""Environments under conditions: physics has the drawn cube, observations and pictures what was
+drawn for them.
+"""
 
 from typing import Any
 
@@ -83,7 +85,11 @@ def test_a_restored_state_has_the_same_future_in_any_environment(other_has_begun
         found: list[Any] = []
         for _ in range(10):
             seen, reward, *_ = of.step(np.zeros(len(of.scene.actions), np.float32))
-            found += [*(value.tolist() for value in seen.values()), reward, of.get_state().to_vector().tolist()]
+            found += [
+                *(value.tolist() for value in seen.values()),
+                reward,
+                of.get_state().to_vector().tolist(),
+            ]
         return found
 
     env.reset(seed=4)
@@ -100,7 +106,9 @@ def test_a_restored_state_has_the_same_future_in_any_environment(other_has_begun
 
 
 def test_a_knock_that_has_happened_does_not_happen_again_in_a_restored_state():
-    env = make_env("panda", "lift", conditions=[Condition("knocked", knock=(0.05, 0.05), knock_step=(0, 0))])
+    env = make_env(
+        "panda", "lift", conditions=[Condition("knocked", knock=(0.05, 0.05), knock_step=(0, 0))]
+    )
     env.reset(seed=0)
     env.observe()
     state = env.get_state()

@@ -57,7 +57,10 @@ def test_a_share_of_the_actions_is_random_and_the_others_are_as_they_were(env: M
     changed = [not np.array_equal(one, action) for one in executed[0]]
     assert 0.2 < np.mean(changed) < 0.4
     actions = env.scene.actions
-    beyond = np.abs(np.array(executed[0]) - env.observe().state)[:, actions.arm] - actions.scale[actions.arm]
+    beyond = (
+        np.abs(np.array(executed[0]) - env.observe().state)[:, actions.arm]
+        - actions.scale[actions.arm]
+    )
     assert beyond.max() < 1e-6
 
 

@@ -34,7 +34,9 @@ def test_every_task_names_its_objects_and_where_they_are_to_go(task: str):
 
 @pytest.mark.gl
 @pytest.mark.parametrize("robot", list(ROBOTS))
-def test_a_spot_that_is_drawn_at_a_point_is_seen_where_the_point_is_said_to_be(robot: str, monkeypatch):
+def test_a_spot_that_is_drawn_at_a_point_is_seen_where_the_point_is_said_to_be(
+    robot: str, monkeypatch
+):
     env = started(robot)
     space = env.scene.robot.workspace
     rng = np.random.default_rng(0)
@@ -51,7 +53,13 @@ def test_a_spot_that_is_drawn_at_a_point_is_seen_where_the_point_is_said_to_be(r
         for camera, marked in with_spots(point).items():
             across, down, in_view = found[camera][number].tolist()
             rows, columns = np.nonzero((marked != plain[camera]).any(axis=2))
-            whole = 8 < len(rows) < 200 and rows.min() and columns.min() and rows.max() < 95 and columns.max() < 127
+            whole = (
+                8 < len(rows) < 200
+                and rows.min()
+                and columns.min()
+                and rows.max() < 95
+                and columns.max() < 127
+            )
             if whole:  # nothing hides it, and the picture's edge does not cut it
                 seen += 1
                 assert in_view

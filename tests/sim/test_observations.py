@@ -15,7 +15,9 @@ from ..tables import every_scene, every_scene_with_cubes
 
 
 def values_of(env: ManipEnv) -> dict[str, float]:
-    return dict(zip(environment_state_names(env.scene), env.observe().environment_state, strict=True))
+    return dict(
+        zip(environment_state_names(env.scene), env.observe().environment_state, strict=True)
+    )
 
 
 def vector(values: dict[str, float], name: str) -> np.ndarray:
@@ -45,7 +47,9 @@ def test_the_cubes_numbers_are_what_their_names_say(robot: str, task: str):
     np.testing.assert_allclose(vector(values, f"{name}_from_ee"), place - hand, atol=1e-6)
     w, _, _, z = env.data.joint(thing).qpos[3:]
     turns = np.exp(4j * 2 * np.arctan2(z, w))
-    assert (values[f"{name}.cos4yaw"], values[f"{name}.sin4yaw"]) == pytest.approx((turns.real, turns.imag), abs=1e-6)
+    assert (values[f"{name}.cos4yaw"], values[f"{name}.sin4yaw"]) == pytest.approx(
+        (turns.real, turns.imag), abs=1e-6
+    )
     assert values[f"{name}.tilt"] == pytest.approx(0, abs=1e-6)
     assert values[f"{name}.width"] == pytest.approx(env.world.extents(thing)[0])
     env.world.vary(with_drawn(env.scene.nominal, {"size": 0.03}))

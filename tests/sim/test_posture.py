@@ -1,4 +1,6 @@
-"""A posture to begin in: near home, touching nothing, the hand within reach, by the episode's seed alone."""
+"""A posture to begin in: near home, touching nothing, the hand within reach, by the episode's
+seed alone.
+"""
 
 import numpy as np
 

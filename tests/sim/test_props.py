@@ -25,7 +25,9 @@ def cluttered(robot: str, task: str = "pick_place", seed: int = SEED, **settings
 
 def things(env: ManipEnv) -> list:
     """What lies around, without the stand of a goal."""
-    return props(env.scene, env.data, part(env.world.variation, "clutter"))[len(props(env.scene, env.data)) :]
+    return props(env.scene, env.data, part(env.world.variation, "clutter"))[
+        len(props(env.scene, env.data)) :
+    ]
 
 
 @every_robot
@@ -66,7 +68,9 @@ def test_cameras_see_the_stand_and_clutter(robot: str):
 
 @pytest.mark.gl
 def test_late_pictures_are_those_of_earlier_steps_and_joints_are_of_now():
-    late = started("panda", cameras=("front",), conditions=[Condition("late", picture_delay=(2, 2))])
+    late = started(
+        "panda", cameras=("front",), conditions=[Condition("late", picture_delay=(2, 2))]
+    )
     prompt = started("panda", cameras=("front",))
     seen = []
     for step in range(5):

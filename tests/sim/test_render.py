@@ -64,7 +64,10 @@ def test_the_wrist_camera_moves_with_the_hand_and_the_front_camera_does_not(env:
     for _ in range(10):
         env.advance(turned)
     after = env.observe().images
-    share = {name: (np.abs(after[name].astype(int) - before[name]).max(axis=2) > 12).mean() for name in CAMERAS}
+    share = {
+        name: (np.abs(after[name].astype(int) - before[name]).max(axis=2) > 12).mean()
+        for name in CAMERAS
+    }
     assert share["wrist"] > 0.1
     assert 0.005 < share["front"] < 0.4
 
@@ -72,7 +75,9 @@ def test_the_wrist_camera_moves_with_the_hand_and_the_front_camera_does_not(env:
 @pytest.mark.gl
 @with_one_robot
 def test_pictures_of_25_environments_are_those_of_one_alone(env: ManipEnv):
-    crowd = [started(env.scene.robot.name, seed=seed, cameras=CAMERAS) for seed in range(SEED, SEED + 25)]
+    crowd = [
+        started(env.scene.robot.name, seed=seed, cameras=CAMERAS) for seed in range(SEED, SEED + 25)
+    ]
     together = [one.observe().images for one in crowd]
     for seed, images in enumerate(together, SEED):
         env.start(seed)
@@ -84,7 +89,9 @@ def test_pictures_of_25_environments_are_those_of_one_alone(env: ManipEnv):
 @with_one_robot
 def test_nothing_that_is_drawn_in_between_changes_a_byte(env: ManipEnv):
     def same() -> bool:
-        return all(np.array_equal(picture, first[name]) for name, picture in env.observe().images.items())
+        return all(
+            np.array_equal(picture, first[name]) for name, picture in env.observe().images.items()
+        )
 
     state, first = env.get_state(), env.observe().images
     assert env.render().shape == (480, 640, 3)
@@ -96,7 +103,8 @@ def test_nothing_that_is_drawn_in_between_changes_a_byte(env: ManipEnv):
     others: list[dict[str, Any]] = [
         {"robot": "fetch", "cameras": ("wrist",)},
         {"robot": "panda", "cameras": ("front",), "look": Look(shadows=True, brightness=2)},
-        {"robot": "panda", "cameras": CAMERAS, "image_size": (720, 1024)},  # larger than the buffer was made
+        # larger than the buffer was made
+        {"robot": "panda", "cameras": CAMERAS, "image_size": (720, 1024)},
         {"robot": "panda", "cameras": CAMERAS, "image_size": (16, 18)},
     ]
     for other in others:
@@ -104,7 +112,9 @@ def test_nothing_that_is_drawn_in_between_changes_a_byte(env: ManipEnv):
         assert same()
 
 
-def _drawn(robot: str, task: str, data: mujoco.MjData, cameras: CameraConfig) -> dict[str, render.Picture]:
+def _drawn(
+    robot: str, task: str, data: mujoco.MjData, cameras: CameraConfig
+) -> dict[str, render.Picture]:
     return render.pictures(scene_of(robot, task), data, cameras)
 
 
@@ -137,6 +147,8 @@ def test_without_opengl_the_error_names_debians_packages(monkeypatch):
 
     monkeypatch.setattr("mujoco.egl.GLContext", broken)
     env = started("panda", "reach", cameras=("front",))
-    with pytest.raises(RenderError, match=r"libEGL\.so\.1.*apt-get install -y libegl1 libegl-mesa0") as caught:
+    with pytest.raises(
+        RenderError, match=r"libEGL\.so\.1.*apt-get install -y libegl1 libegl-mesa0"
+    ) as caught:
         env.observe()
     assert caught.value.exit_code == 1

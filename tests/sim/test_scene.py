@@ -24,7 +24,9 @@ def test_an_arm_told_to_stand_still_and_an_untouched_cube_do(robot: str, task: s
     np.testing.assert_allclose(env.data.qpos[env.scene.arm_q], q, atol=2e-3)
     for name, at in lying.items():
         np.testing.assert_allclose(env.world.pose(name).position, at, atol=1e-3)
-        assert env.world.pose(name).position[2] == pytest.approx(half_height(env.world, name), abs=5e-4)
+        assert env.world.pose(name).position[2] == pytest.approx(
+            half_height(env.world, name), abs=5e-4
+        )
 
 
 @every_robot
@@ -45,4 +47,6 @@ def test_a_held_cube_creeps_less_than_a_millimetre_in_5_s(robot: str):
 def test_a_scene_is_compiled_once_and_is_the_same_bytes_again(robot: str, task: str):
     scene = scene_of(robot, task)
     assert scene_of(robot, task) is scene
-    assert model_bytes(build_scene.__wrapped__(get_robot(robot), TASKS[task]).model) == model_bytes(scene.model)
+    assert model_bytes(build_scene.__wrapped__(get_robot(robot), TASKS[task]).model) == model_bytes(
+        scene.model
+    )

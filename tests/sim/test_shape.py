@@ -26,12 +26,16 @@ from manip_il.worlds.table import make_config
         ("capsule:0.03x0.1", (0.03, 0.03, 0.1)),
     ],
 )
-def test_a_text_means_lengths_along_the_shapes_own_axes(text: str, meant: tuple[float, float, float]):
+def test_a_text_means_lengths_along_the_shapes_own_axes(
+    text: str, meant: tuple[float, float, float]
+):
     assert ObjectShape.parse(text).lengths == pytest.approx(meant)
     assert ObjectShape.parse(str(ObjectShape.parse(text))) == ObjectShape.parse(text)
 
 
-@pytest.mark.parametrize("text", ["box:0.06x0.03x0.04", "cylinder:0.04x0.08", "sphere:0.06", "capsule:0.04x0.1"])
+@pytest.mark.parametrize(
+    "text", ["box:0.06x0.03x0.04", "cylinder:0.04x0.08", "sphere:0.06", "capsule:0.04x0.1"]
+)
 def test_the_model_has_the_lengths_and_the_mass(text: str):
     shape, scene = ObjectShape.parse(text), scene_of("panda", "pick_place", text)
     one = scene.objects["object"]
@@ -50,9 +54,12 @@ def test_a_cube_of_5_cm_is_the_default():
 
 
 def test_what_is_wider_than_the_gripper_opens_is_refused_with_both_numbers():
-    with pytest.raises(UsageError, match=r"'object' is 0.090 m wide, and the gripper of panda opens to 0.078 m"):
+    with pytest.raises(
+        UsageError, match=r"'object' is 0.090 m wide, and the gripper of panda opens to 0.078 m"
+    ):
         scene_of("panda", "pick_place", "sphere:0.09")
-    with pytest.raises(UsageError, match=r"0.080 m wide"):  # on its largest face, nothing narrower is left
+    # on its largest face, nothing narrower is left
+    with pytest.raises(UsageError, match=r"0.080 m wide"):
         scene_of("panda", "lift", "box:0.08x0.1x0.02")
 
 
@@ -62,6 +69,9 @@ def test_a_task_with_objects_of_its_own_takes_no_other():
 
 
 def test_an_instruction_names_the_shape():
-    assert get_task("lift", "capsule:0.03").instruction == "Lift the capsule to the green goal above it."
+    assert (
+        get_task("lift", "capsule:0.03").instruction
+        == "Lift the capsule to the green goal above it."
+    )
     assert get_task("lift", "any").instruction == "Lift the object to the green goal above it."
     assert get_task("lift", "box:0.03").instruction == get_task("lift").instruction

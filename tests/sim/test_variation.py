@@ -1,4 +1,6 @@
-"""A variation is five numbers an object (half its lengths, its mass, its friction), and what the world draws."""
+"""A variation is five numbers an object (half its lengths, its mass, its friction), and what the
+world draws.
+"""
 
 import copy
 
@@ -17,7 +19,8 @@ from manip_il.sim.variation import (
 from manip_il.sim.world import World
 from manip_il.worlds.ladder.world import scene_of
 
-WHERE_IT_WAS_MADE = {"body_pos", "qpos0", "qpos_spring", "cam_poscom0", "light_poscom0"}  # which no start keeps
+# which no start keeps
+WHERE_IT_WAS_MADE = {"body_pos", "qpos0", "qpos_spring", "cam_poscom0", "light_poscom0"}
 NO_MOTORS = np.array([], dtype=np.int64)
 
 
@@ -36,7 +39,9 @@ CUBE, TALL = [0.025, 0.025, 0.025, 0.1, 1.0], [0.01, 0.02, 0.04, 0.1, 1.0]
         ([], {"mass": 0.2, "size": 0.05}, []),
     ],
 )
-def test_what_is_drawn_stands_at_its_place_and_the_rest_as_it_was(before: list[float], drawn, after: list[float]):
+def test_what_is_drawn_stands_at_its_place_and_the_rest_as_it_was(
+    before: list[float], drawn, after: list[float]
+):
     base = np.array([*before, *NOTHING_DRAWN])
     np.testing.assert_allclose(with_drawn(base, drawn)[: len(after)], after)
     assert base.tolist() == [*before, *NOTHING_DRAWN]
@@ -70,7 +75,13 @@ def test_every_geom_of_an_object_touches_the_table_whatever_is_drawn():
     <geom type="box" size="0.01 0.01 0.04" pos="-0.1 0 0" mass="0.1"/></body></worldbody></mujoco>"""
     plain = mujoco.MjSpec.from_string(bar).compile()
     changed, like = copy.copy(plain), np.array([0.1, 0.01, 0.005, 0.3, 1.0, *NOTHING_DRAWN])
-    apply(changed, plain, {"bar": Object("bar", 1, 1, 0, 0)}, NO_MOTORS, with_drawn(like, {"friction": 0.9}))
+    apply(
+        changed,
+        plain,
+        {"bar": Object("bar", 1, 1, 0, 0)},
+        NO_MOTORS,
+        with_drawn(like, {"friction": 0.9}),
+    )
     data = mujoco.MjData(changed)
     mujoco.mj_step(changed, data, 500)
     assert data.qpos[2] == pytest.approx(0.04, abs=1e-3)

@@ -13,7 +13,8 @@ def test_without_a_display_human_is_refused_in_one_line(display, monkeypatch):
     monkeypatch.setenv("DISPLAY", display)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     says = (
-        rf'^no display: DISPLAY={display}, WAYLAND_DISPLAY=; use render_mode="rgb_array", or manip-il view --output=.*$'
+        rf'^no display: DISPLAY={display}, WAYLAND_DISPLAY=; use render_mode="rgb_array", or'
+        r" manip-il view --output=.*$"
     )
     with pytest.raises(RenderError, match=says):
         gymnasium.make("manip_il/PandaReach-v0", render_mode="human")

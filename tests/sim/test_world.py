@@ -1,4 +1,7 @@
-"""A world is one scene in one state, asked by name; its model is its own only where it was varied."""
+"""A world is one scene in one state, asked by name.
+
+Its model is its own only where it was varied.
+"""
 
 import mujoco
 import numpy as np
@@ -25,8 +28,12 @@ def world(request) -> World:
 def fall(world: World, steps: int = 60) -> bytes:
     """The physics of a world in which the cube falls onto the table and the arm stays."""
     mujoco.mj_resetData(world.model, world.data)
-    world.data.qpos[world.scene.arm_q] = world.data.ctrl[world.scene.arm_ctrl] = world.scene.robot.home
-    world.place(OBJECT, [*world.scene.robot.workspace.centre, 0.06] + BESIDE, np.array([0.9, 0.1, 0.3, 0.3]))
+    world.data.qpos[world.scene.arm_q] = world.data.ctrl[world.scene.arm_ctrl] = (
+        world.scene.robot.home
+    )
+    world.place(
+        OBJECT, [*world.scene.robot.workspace.centre, 0.06] + BESIDE, np.array([0.9, 0.1, 0.3, 0.3])
+    )
     mujoco.mj_step(world.model, world.data, steps)
     return world.physics().tobytes()
 
@@ -62,12 +69,20 @@ def test_the_drawn_friction_counts_whatever_the_cube_touches(world: World):
 
 
 @every_scene
-def test_the_arm_is_damped_and_driven_as_the_variation_says_and_the_gripper_as_ever(robot: str, task: str):
+def test_the_arm_is_damped_and_driven_as_the_variation_says_and_the_gripper_as_ever(
+    robot: str, task: str
+):
     world = World(scene_of(robot, task))
     world.vary(with_drawn(world.scene.nominal, {"joint_damping": 3.0, "actuator_gain": 0.64}))
     model, plain, arm = world.model, world.scene.model, world.scene.arm_ctrl
     dofs = [model.joint(f"robot/{name}").dofadr[0] for name in world.scene.robot.joints]
     np.testing.assert_allclose(model.dof_damping[dofs], 3.0 * plain.dof_damping[dofs])
-    np.testing.assert_allclose(model.actuator_gainprm[arm, 0], 0.64 * plain.actuator_gainprm[arm, 0])
-    np.testing.assert_allclose(model.actuator_biasprm[arm, 1:3], plain.actuator_biasprm[arm, 1:3] * [0.64, 0.8])
-    np.testing.assert_array_equal(np.delete(model.dof_damping, dofs), np.delete(plain.dof_damping, dofs))
+    np.testing.assert_allclose(
+        model.actuator_gainprm[arm, 0], 0.64 * plain.actuator_gainprm[arm, 0]
+    )
+    np.testing.assert_allclose(
+        model.actuator_biasprm[arm, 1:3], plain.actuator_biasprm[arm, 1:3] * [0.64, 0.8]
+    )
+    np.testing.assert_array_equal(
+        np.delete(model.dof_damping, dofs), np.delete(plain.dof_damping, dofs)
+    )

@@ -54,7 +54,9 @@ def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
     if request.param == "hub":
         request.getfixturevalue("hub")
         return POLICY
-    return f"file://{tmp_path}/store" if request.param == "file" else request.getfixturevalue("bucket")
+    return (
+        f"file://{tmp_path}/store" if request.param == "file" else request.getfixturevalue("bucket")
+    )
 
 
 def make_run(folder: Path, seed: int = 1, size: int = 20_000) -> Path:
@@ -64,7 +66,12 @@ def make_run(folder: Path, seed: int = 1, size: int = 20_000) -> Path:
     (folder / "checkpoints" / "last").symlink_to("000004")
     (folder / "README.md").write_text("# By hand\n")
     (folder / "config.yaml").write_text("# manip-il 0.1.0: resolved options (TrainOptions)\n")
-    for name, data in {"same.json": b"{}", "copy.json": b"{}", "empty.txt": b"", "new.txt": rng.bytes(99)}.items():
+    for name, data in {
+        "same.json": b"{}",
+        "copy.json": b"{}",
+        "empty.txt": b"",
+        "new.txt": rng.bytes(99),
+    }.items():
         (folder / name).write_bytes(data)
     (model / "config.json").write_text(f'{{"type": "act", "seed": {seed}}}')
     (model / "model.safetensors").write_bytes(rng.bytes(size))
@@ -73,5 +80,12 @@ def make_run(folder: Path, seed: int = 1, size: int = 20_000) -> Path:
 
 def content(folder: Path) -> dict[str, object]:
     """Everything below: bytes of files, targets of links."""
-    paths = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_symlink() or path.is_file()}
-    return {name: os.readlink(path) if path.is_symlink() else path.read_bytes() for name, path in paths.items()}
+    paths = {
+        str(path.relative_to(folder)): path
+        for path in folder.rglob("*")
+        if path.is_symlink() or path.is_file()
+    }
+    return {
+        name: os.readlink(path) if path.is_symlink() else path.read_bytes()
+        for name, path in paths.items()
+    }

@@ -1,4 +1,6 @@
-"""Servers on loopback: a Hub in memory, moto's S3, and Debian's sshd with nothing of the machine's own."""
+"""Servers on loopback: a Hub in memory, moto's S3, and Debian's sshd with nothing of the
+machine's own.
+"""
 
 import base64
 import getpass
@@ -54,7 +56,8 @@ class Repo:
 class Hub:
     """Repositories by name (`datasets/user/name`), and objects by sha256.
 
-    change: of a body that goes out. headers: further ones of an answer. tokens: with which it was asked.
+    change: of a body that goes out. headers: further ones of an answer. tokens: with which it was
+    asked.
     """
 
     repos: dict[str, Repo] = field(default_factory=dict)
@@ -103,11 +106,16 @@ def hub_app(hub: Hub) -> Flask:
     @app.post("/api/repos/create")
     def create() -> Any:
         asked = request.get_json()
-        kind, name = f"{asked.get('type') or 'model'}s", f"{asked.get('organization') or 'user'}/{asked['name']}"
+        kind, name = (
+            f"{asked.get('type') or 'model'}s",
+            f"{asked.get('organization') or 'user'}/{asked['name']}",
+        )
         about = {"url": f"{hub.url}/{'datasets/' * (kind == 'datasets')}{name}", "name": name}
         if f"{kind}/{name}" in hub.repos:
             return about | {"error": "You already created this repo"}, 409
-        repo = hub.repos[f"{kind}/{name}"] = Repo(asked.get("private") or asked.get("visibility") == "private")
+        repo = hub.repos[f"{kind}/{name}"] = Repo(
+            asked.get("private") or asked.get("visibility") == "private"
+        )
         repo.commit("main", {".gitattributes": b"*.parquet filter=lfs\n"})
         return about
 
@@ -117,17 +125,24 @@ def hub_app(hub: Hub) -> Flask:
 
     @app.post(f"{api}/preupload/<revision>")
     def preupload(repo: Repo, revision: str) -> Any:
-        modes = {one["path"]: one["path"].endswith(LFS_SUFFIXES) for one in request.get_json()["files"]}
+        modes = {
+            one["path"]: one["path"].endswith(LFS_SUFFIXES) for one in request.get_json()["files"]
+        }
         return {"files": [{"path": path, "uploadMode": "lfs" if lfs else "regular", "shouldIgnore": False}
                           for path, lfs in modes.items()]}  # fmt: skip
 
     @app.post("/<user>/<name>.git/info/lfs/objects/batch")
     @app.post("/<any(datasets):kind>/<user>/<name>.git/info/lfs/objects/batch")
     def lfs_batch(repo: Repo) -> Any:
-        objects = [{"oid": one["oid"], "size": one["size"]} for one in request.get_json(force=True)["objects"]]
+        objects = [
+            {"oid": one["oid"], "size": one["size"]}
+            for one in request.get_json(force=True)["objects"]
+        ]
         for one in objects:
             if one["oid"] not in hub.objects:
-                one["actions"] = {"upload": {"href": f"{hub.url}/lfs/{one['oid']}?X-Amz-Signature=of-an-upload"}}
+                one["actions"] = {
+                    "upload": {"href": f"{hub.url}/lfs/{one['oid']}?X-Amz-Signature=of-an-upload"}
+                }
         return {"transfer": "basic", "objects": objects}
 
     @app.put("/lfs/<sha256>")
@@ -173,11 +188,20 @@ def hub_app(hub: Hub) -> Flask:
     def info(repo: Repo, revision: str = "main") -> Any:
         sha, files = repo.find(revision)
         siblings = [{"rfilename": path} for path in files]
-        return {"_id": "0", "id": "user/name", "sha": sha, "private": repo.private, "siblings": siblings, "tags": []}
+        return {
+            "_id": "0",
+            "id": "user/name",
+            "sha": sha,
+            "private": repo.private,
+            "siblings": siblings,
+            "tags": [],
+        }
 
     @app.get(f"{api}/tree/<revision>")
     def tree(repo: Repo, revision: str) -> Any:
-        found: list[dict[str, Any]] = [{"type": "directory", "path": "meta", "oid": "0" * 40, "size": 0}]
+        found: list[dict[str, Any]] = [
+            {"type": "directory", "path": "meta", "oid": "0" * 40, "size": 0}
+        ]
         for path, data in repo.find(revision)[1].items():
             one = {"oid": oid(path, data), "size": len(data)}
             lfs = {"lfs": {**one, "pointerSize": 130}} if path.endswith(LFS_SUFFIXES) else {}
@@ -191,8 +215,17 @@ def hub_app(hub: Hub) -> Flask:
         if path not in files:
             refuse(404, f"{path} does not exist on {revision}", "EntryNotFound")
         etag = f'"{oid(path, files[path])}"'
-        linked = {"X-Linked-Etag": etag, "X-Linked-Size": str(len(files[path]))} if path.endswith(LFS_SUFFIXES) else {}
-        return files[path], {"ETag": etag, "X-Repo-Commit": sha, "Content-Type": "application/octet-stream", **linked}
+        linked = (
+            {"X-Linked-Etag": etag, "X-Linked-Size": str(len(files[path]))}
+            if path.endswith(LFS_SUFFIXES)
+            else {}
+        )
+        return files[path], {
+            "ETag": etag,
+            "X-Repo-Commit": sha,
+            "Content-Type": "application/octet-stream",
+            **linked,
+        }
 
     return app
 
@@ -213,9 +246,13 @@ def hub_server() -> Iterator[Hub]:
 
 def talk_to(url: str, set_attribute: Callable[[object, str, object], None] = setattr) -> None:
     """Have huggingface_hub in this process know no other Hub."""
-    given = {"ENDPOINT": url, "HUGGINGFACE_CO_URL_TEMPLATE": url + "/{repo_id}/resolve/{revision}/{filename}"}
+    given = {
+        "ENDPOINT": url,
+        "HUGGINGFACE_CO_URL_TEMPLATE": url + "/{repo_id}/resolve/{revision}/{filename}",
+    }
     more = {"HF_HUB_DISABLE_XET": True, "HF_HUB_OFFLINE": False, "HF_TOKEN_PATH": "/no/token"}
-    more |= dict.fromkeys(("HF_HUB_DOWNLOAD_TIMEOUT", "HF_HUB_ETAG_TIMEOUT"), 600)  # on a machine that does much else
+    # on a machine that does much else
+    more |= dict.fromkeys(("HF_HUB_DOWNLOAD_TIMEOUT", "HF_HUB_ETAG_TIMEOUT"), 600)
     for name, value in (given | more).items():
         set_attribute(constants, name, value)
 
@@ -228,10 +265,18 @@ def s3_server(bucket: str) -> Iterator[dict[str, str]]:
     server.start()
     try:
         endpoint = "http://{}:{}".format(*server.get_host_and_port())
-        given = {"endpoint_url": endpoint, "aws_access_key_id": KEY, "aws_secret_access_key": SECRET}
+        given = {
+            "endpoint_url": endpoint,
+            "aws_access_key_id": KEY,
+            "aws_secret_access_key": SECRET,
+        }
         boto3.client("s3", **given, region_name="us-east-1").create_bucket(Bucket=bucket)
         none = {"AWS_CONFIG_FILE": "/dev/null", "AWS_SHARED_CREDENTIALS_FILE": "/dev/null"}
-        more = {"AWS_ENDPOINT_URL": endpoint, "AWS_EC2_METADATA_DISABLED": "true", "AWS_DEFAULT_REGION": "us-east-1"}
+        more = {
+            "AWS_ENDPOINT_URL": endpoint,
+            "AWS_EC2_METADATA_DISABLED": "true",
+            "AWS_DEFAULT_REGION": "us-east-1",
+        }
         yield {"AWS_ACCESS_KEY_ID": KEY, "AWS_SECRET_ACCESS_KEY": SECRET, **none, **more}
     finally:
         server.stop()
@@ -267,8 +312,11 @@ def sshd_server(folder: Path) -> Iterator[Sshd]:
     if not Path(SSHD).is_file():
         raise RuntimeError(f"{SSHD} is missing: as root: .ci/system sshd")
     for name in ("host_key", "user_key"):
-        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(folder / name)], check=True)
-    port = 20_000 + os.getpid() % 10_000  # below those that the kernel gives to whoever asks for any
+        subprocess.run(
+            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(folder / name)], check=True
+        )
+    # below those that the kernel gives to whoever asks for any
+    port = 20_000 + os.getpid() % 10_000
     (folder / "sshd_config").write_text(SSHD_CONFIG.format(port=port, folder=folder))
     ssh = folder / "home" / ".ssh"
     ssh.mkdir(parents=True)

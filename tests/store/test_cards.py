@@ -1,4 +1,6 @@
-"""Cards: valid for the Hub, the same every time, silent about places and secrets, and honest about who made what."""
+"""Cards: valid for the Hub, the same every time, silent about places and secrets, and honest
+about who made what.
+"""
 
 import json
 import shutil
@@ -19,7 +21,12 @@ from ..learn.tiny_policies import write_checkpoint
 from .conftest import SAMPLE
 
 CARD = "README.md"
-EVALUATION = {"success_rate": 0.84, "interval": [0.756, 0.899], "confidence": 0.95, "n_episodes": 100}
+EVALUATION = {
+    "success_rate": 0.84,
+    "interval": [0.756, 0.899],
+    "confidence": 0.95,
+    "n_episodes": 100,
+}
 
 
 def cards(root: Path, kind: str = "dataset", place: str = "user/demos") -> dict[str, bytes]:
@@ -33,12 +40,20 @@ def demos(tmp_path: Path) -> Path:
     return shutil.copytree(SAMPLE, tmp_path / "demos")
 
 
-def test_a_datasets_card_says_what_the_hub_reads_and_claims_nothing_of_what_others_made(demos: Path, tmp_path: Path):
+def test_a_datasets_card_says_what_the_hub_reads_and_claims_nothing_of_what_others_made(
+    demos: Path, tmp_path: Path
+):
     files = cards(demos)
     text, data = files[CARD].decode(), DatasetCard(files[CARD].decode()).data.to_dict()
     assert (data["license"], data["task_categories"]) == ("apache-2.0", ["robotics"])
     assert {"LeRobot", "robotics", "manip_il", "panda", "pick_place"} == set(data["tags"])
-    for fact in ("| episodes | 10 |", "375 at 20 a second", "10 of 10", "1000000 to 1000009", "model_sha256"):
+    for fact in (
+        "| episodes | 10 |",
+        "375 at 20 a second",
+        "10 of 10",
+        "1000000 to 1000009",
+        "model_sha256",
+    ):
         assert fact in text
     assert 'LeRobotDataset("user/demos")' in text
     assert cards(shutil.copytree(SAMPLE, tmp_path / "again")) == files
@@ -67,11 +82,20 @@ def test_a_card_tells_no_secret(demos: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_value_stays_on_its_line_of_a_command(tmp_path: Path):
-    meta, root = Origin("panda", "pick_place", 20, ("joint",), ("object.x",), "", {}, {}), tmp_path / "policy"
+    meta, root = (
+        Origin("panda", "pick_place", 20, ("joint",), ("object.x",), "", {}, {}),
+        tmp_path / "policy",
+    )
     write_checkpoint(root, "act", Dataset.open(SAMPLE).spec, origin=meta)
     fences = cards(root, "policy", "user/act")[CARD].count(b"\n```")
     about, evil = json.loads((root / "manip_il.json").read_text()), "x\nrm -rf ~\n```\r$(rm -rf ~)"
-    values = {"object": evil, "task": f"pick_place:{evil}", "cameras": [evil], "image_size": [evil, 1], "fps": evil}
+    values = {
+        "object": evil,
+        "task": f"pick_place:{evil}",
+        "cameras": [evil],
+        "image_size": [evil, 1],
+        "fps": evil,
+    }
     (root / "manip_il.json").write_text(json.dumps(about | values))
     text = cards(root, "policy", "user/act")[CARD].decode()
     assert not [line for line in text.splitlines() if line.lstrip().startswith(("rm -rf", "$"))]
@@ -81,19 +105,32 @@ def test_a_value_stays_on_its_line_of_a_command(tmp_path: Path):
 
 def test_a_policys_card_is_of_its_best_policy_and_says_how_well_it_does(tmp_path: Path):
     spec, run = Dataset.open(SAMPLE).spec, tmp_path / "run"
-    meta = Origin("panda", "pick_place", 20, ("joint",), ("object.x",), "joint targets [rad]", {}, {})
-    write_checkpoint(run / "round_00" / "policy" / "checkpoints" / "000002" / "pretrained_model", "diffusion", spec)
+    meta = Origin(
+        "panda", "pick_place", 20, ("joint",), ("object.x",), "joint targets [rad]", {}, {}
+    )
+    write_checkpoint(
+        run / "round_00" / "policy" / "checkpoints" / "000002" / "pretrained_model",
+        "diffusion",
+        spec,
+    )
     write_checkpoint(run / "best" / "pretrained_model", "act", spec, origin=meta)
     assert "not measured" in cards(run, "policy", "user/act")[CARD].decode()
     better = EVALUATION | {"success_rate": 0.97, "n_episodes": 500}
-    others = {"easy": better | {"settings": {"suite": "easy"}}, "other": better | {"policy_sha256": "another"}}
+    others = {
+        "easy": better | {"settings": {"suite": "easy"}},
+        "other": better | {"policy_sha256": "another"},
+    }
     own = EVALUATION | {"policy_sha256": policy_sha256(run / "best" / "pretrained_model")}
     for place, more in {"eval": {}, "validation/3": better, "round_1": better, **others}.items():
         (run / place).mkdir(parents=True)
         (run / place / "eval.json").write_text(json.dumps(own | more))
     text = cards(run, "policy", "user/act")[CARD].decode()
     data = ModelCard(text).data.to_dict()
-    assert (data["license"], data["library_name"], data["pipeline_tag"]) == ("apache-2.0", "lerobot", "robotics")
+    assert (data["license"], data["library_name"], data["pipeline_tag"]) == (
+        "apache-2.0",
+        "lerobot",
+        "robotics",
+    )
     assert data["model-index"][0]["results"][0]["metrics"][0]["value"] == pytest.approx(0.84)
     assert "**84.0%** [75.6%, 89.9%] (95% interval, 100 episodes), on unseen seeds" in text
     assert "--env.task=PandaPickPlace-v0 \\\n  --env.fps=20" in text

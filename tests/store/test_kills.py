@@ -1,4 +1,6 @@
-"""kill -9 at random moments, in either direction: readers see a whole version, and the next try succeeds."""
+"""kill -9 at random moments, in either direction: readers see a whole version, and the next try
+succeeds.
+"""
 
 import multiprocessing
 import os

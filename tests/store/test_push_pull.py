@@ -1,4 +1,7 @@
-"""What is pulled is what was pushed; what has not changed does not travel; readers see one version or the other."""
+"""What is pulled is what was pushed; what has not changed does not travel.
+
+Readers see one version or the other.
+"""
 
 import hashlib
 import json
@@ -42,7 +45,9 @@ def test_a_run_comes_back_as_it_was_and_only_changes_travel(place: str, tmp_path
     assert not list(tmp_path.glob(".got*"))
 
 
-def test_a_reader_of_the_version_before_finishes_while_a_new_one_is_pushed(place: str, tmp_path: Path):
+def test_a_reader_of_the_version_before_finishes_while_a_new_one_is_pushed(
+    place: str, tmp_path: Path
+):
     push(make_run(tmp_path / "a", 1), open_quietly(place))
     reader = open_quietly(place)
     old = reader.read()
@@ -65,7 +70,9 @@ def test_of_two_pushes_one_wins_and_the_other_is_told(place: str, tmp_path: Path
     assert content(tmp_path / "got") == content(runs[1])
 
 
-def test_s3_itself_refuses_a_manifest_that_replaces_another_than_was_read(bucket: str, tmp_path: Path, monkeypatch):
+def test_s3_itself_refuses_a_manifest_that_replaces_another_than_was_read(
+    bucket: str, tmp_path: Path, monkeypatch
+):
     remote = Objects("s3", bucket, quiet=True)
     push(make_run(tmp_path / "run"), remote)
     found = remote.read()
@@ -89,7 +96,8 @@ def test_journals_go_along_when_asked_and_lie_beside_again(tmp_path: Path):
     assert content(tmp_path / "got.journals") == content(tmp_path / "d.journals")
     shutil.rmtree(tmp_path / "got")  # as a kill between the two renames leaves it
     pull(open_quietly(url), tmp_path / "got")
-    (tmp_path / "got.journals" / "recording.json").unlink()  # so that nothing says that they are ours
+    # so that nothing says that they are ours
+    (tmp_path / "got.journals" / "recording.json").unlink()
     (tmp_path / "got.journals" / "thesis.tex").touch()
     before = content(tmp_path)
     for overwrite in (False, True):
@@ -113,7 +121,10 @@ def test_a_store_of_the_version_before_is_read_and_what_nobody_needs_removed(tmp
 
 def test_a_push_removes_what_the_manifest_before_lists_and_nothing_else(tmp_path: Path):
     store, run = tmp_path / "store", make_run(tmp_path / "run")
-    others = {f"objects/{name}": b"of others" for name in ("00/" + "00" * 32, ".DS_Store", "3f/.nfs0001", "notes/x")}
+    others = {
+        f"objects/{name}": b"of others"
+        for name in ("00/" + "00" * 32, ".DS_Store", "3f/.nfs0001", "notes/x")
+    }
     for name, data in others.items():
         (store / name).parent.mkdir(parents=True, exist_ok=True)
         (store / name).write_bytes(data)
@@ -127,7 +138,9 @@ def test_a_push_removes_what_the_manifest_before_lists_and_nothing_else(tmp_path
 
 
 @pytest.mark.parametrize("scheme", ["file", pytest.param("sftp", marks=pytest.mark.slow)])
-def test_nothing_is_written_through_a_link_in_a_store(scheme: str, tmp_path: Path, monkeypatch, request):
+def test_nothing_is_written_through_a_link_in_a_store(
+    scheme: str, tmp_path: Path, monkeypatch, request
+):
     run, store, mine = make_run(tmp_path / "run"), tmp_path / "store", tmp_path / "thesis.tex"
     url = f"file://{store}"
     if scheme == "sftp":
@@ -151,9 +164,15 @@ def test_nothing_is_written_through_a_link_in_a_store(scheme: str, tmp_path: Pat
 
 
 @pytest.mark.parametrize("url", [DATASET, POLICY])
-def test_what_others_keep_in_a_repository_stays_and_a_card_that_was_edited_there(url: str, hub: Hub, tmp_path: Path):
+def test_what_others_keep_in_a_repository_stays_and_a_card_that_was_edited_there(
+    url: str, hub: Hub, tmp_path: Path
+):
     source = tmp_path / "source"
-    shutil.copytree(SAMPLE, source) if url == DATASET else write_checkpoint(source, "act", Dataset.open(SAMPLE).spec)
+    (
+        shutil.copytree(SAMPLE, source)
+        if url == DATASET
+        else write_checkpoint(source, "act", Dataset.open(SAMPLE).spec)
+    )
     (source / "notes.txt").write_text("ours")
     push(source, open_quietly(url))
     repo = hub.repos[url.removeprefix("hf://") if url == DATASET else "models/user/policy"]
@@ -170,11 +189,15 @@ def test_what_others_keep_in_a_repository_stays_and_a_card_that_was_edited_there
     assert "notes.txt" not in after
 
 
-def test_a_dataset_replaces_that_of_another_program_without_what_is_beside_it(hub: Hub, tmp_path: Path):
+def test_a_dataset_replaces_that_of_another_program_without_what_is_beside_it(
+    hub: Hub, tmp_path: Path
+):
     push(SAMPLE, open_quietly(DATASET))
     repo = hub.repos["datasets/user/demos"]
     files = {path: data for path, data in repo.find("main")[1].items() if path != MANIFEST_FILE}
-    repo.commit("main", {**files, "data/chunk-000/file-001.parquet": b"PAR1", "paper.pdf": b"of others"})
+    repo.commit(
+        "main", {**files, "data/chunk-000/file-001.parquet": b"PAR1", "paper.pdf": b"of others"}
+    )
     demos = shutil.copytree(SAMPLE, tmp_path / "demos")
     (demos / "notes.txt").write_text("more")
     push(demos, open_quietly(DATASET))
@@ -197,7 +220,9 @@ def test_a_dataset_is_examined_before_its_push_and_links_are_not_followed(tmp_pa
     assert not (tmp_path / "store").exists()
 
 
-def test_a_hub_shows_lerobot_a_dataset_by_its_tag_and_a_runs_policy_at_the_root(hub: Hub, tmp_path: Path):
+def test_a_hub_shows_lerobot_a_dataset_by_its_tag_and_a_runs_policy_at_the_root(
+    hub: Hub, tmp_path: Path
+):
     push(SAMPLE, open_quietly(DATASET))
     repo, more = hub.repos["datasets/user/demos"], shutil.copytree(SAMPLE, tmp_path / "demos")
     (more / "notes.txt").write_text("more")

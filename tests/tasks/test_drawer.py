@@ -14,7 +14,10 @@ from ..scenes import started
 
 @pytest.mark.parametrize(
     ("pulled", "rungs"),
-    [(0.12, {"to_make_way", "make_way", "leave", "put_aside", "set_down"}), (0.0, {"put_aside", "set_down"})],
+    [
+        (0.12, {"to_make_way", "make_way", "leave", "put_aside", "set_down"}),
+        (0.0, {"put_aside", "set_down"}),
+    ],
 )
 def test_a_cube_before_the_drawer_is_moved_out_of_its_way_first(pulled: float, rungs: set[str]):
     env = started("panda", "drawer")

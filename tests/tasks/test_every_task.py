@@ -1,4 +1,6 @@
-"""What holds for every task on every robot: its ladder, its progress, its end, its name in a fingerprint."""
+"""What holds for every task on every robot: its ladder, its progress, its end, its name in a
+fingerprint.
+"""
 
 import copy
 from collections.abc import Callable
@@ -73,7 +75,9 @@ def test_the_last_rung_holds_everywhere(robot: str, task: str):
     world, rng = World(scene_of(robot, task)), np.random.default_rng(0)
     scene = world.scene
     for _ in range(20):
-        world.data.qpos[scene.arm_q] = np.asarray(scene.robot.home) + rng.uniform(-1, 1, len(scene.robot.joints))
+        world.data.qpos[scene.arm_q] = np.asarray(scene.robot.home) + rng.uniform(
+            -1, 1, len(scene.robot.joints)
+        )
         world.data.qpos[scene.gripper.q] = scene.gripper.command(rng.uniform(0, 0.1))
         for name in scene.objects:
             turn = rng.normal(size=4)
@@ -89,10 +93,22 @@ def test_the_last_rung_holds_everywhere(robot: str, task: str):
 @every_task
 def test_every_rung_of_the_ladder_occurs(task: str):
     seen = set[str]()
-    for driver, conditions, horizon in (("expert", (), 0), ("expert", (STANDARD,), 120), ("random", (), 45)):
-        job = RolloutJob(make_config("panda", task, horizon=horizon), driver_of(driver), hold=2, conditions=conditions)
+    for driver, conditions, horizon in (
+        ("expert", (), 0),
+        ("expert", (STANDARD,), 120),
+        ("random", (), 45),
+    ):
+        job = RolloutJob(
+            make_config("panda", task, horizon=horizon),
+            driver_of(driver),
+            hold=2,
+            conditions=conditions,
+        )
         for episode in job.run(SEEDS):
-            seen |= {phases(TASKS[task])[phase] for phase in set(episode.columns[EXPERT_PHASE].ravel().tolist())}
+            seen |= {
+                phases(TASKS[task])[phase]
+                for phase in set(episode.columns[EXPERT_PHASE].ravel().tolist())
+            }
     missing = {rung.name for rung in TASKS[task].rungs} - seen
     assert missing <= RARE.get(task, set())
 
@@ -122,7 +138,9 @@ def driven_by_expert(robot: str, task: str, other_cubes: bool = False) -> list[D
     ("robot", "task", "other_cubes"),
     [*((*scene, False) for scene in SCENES), *((*scene, True) for scene in WITH_A_CUBE)],
 )
-def test_progress_never_falls_along_the_experts_path_and_ends_at_one(robot: str, task: str, other_cubes: bool):
+def test_progress_never_falls_along_the_experts_path_and_ends_at_one(
+    robot: str, task: str, other_cubes: bool
+):
     for path, solved, _ in driven_by_expert(robot, task, other_cubes):
         assert solved
         assert 0 <= min(path) <= path[0] < 0.9
@@ -143,7 +161,9 @@ def test_progress_is_a_share_wherever_the_arm_gets_to(robot: str, task: str):
 
 
 @every_scene
-def test_what_is_solved_is_at_the_goal_within_the_tolerance_and_what_is_not_is_not(robot: str, task: str):
+def test_what_is_solved_is_at_the_goal_within_the_tolerance_and_what_is_not_is_not(
+    robot: str, task: str
+):
     env, fresh = make_env(robot, task), make_env(robot, task)
     for driven in driven_by_expert(robot, task):
         assert driven.solved
@@ -151,7 +171,11 @@ def test_what_is_solved_is_at_the_goal_within_the_tolerance_and_what_is_not_is_n
         assert TASKS[task].error(env.world) == env.distance() < env.config.tolerance
         if has_goal(env.world):
             world = env.world
-            at = world.pose(TASKS[task].objects[0]).position if TASKS[task].objects else world.ee.position
+            at = (
+                world.pose(TASKS[task].objects[0]).position
+                if TASKS[task].objects
+                else world.ee.position
+            )
             assert np.linalg.norm((at - world.goal)[:2]) < env.config.tolerance
             fresh.set_state(env.get_state())
             fresh.world.place(GOAL, fresh.world.goal + [0.1, 0.0, 0.0], UPRIGHT)

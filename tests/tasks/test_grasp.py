@@ -21,7 +21,13 @@ from manip_il.worlds.table import make_config
 
 from ..scenes import SEED, started
 
-SHAPES = ("box:0.06x0.04x0.03", "box:0.03x0.03x0.06", "cylinder:0.04x0.06", "sphere:0.04", "capsule:0.03x0.06")
+SHAPES = (
+    "box:0.06x0.04x0.03",
+    "box:0.03x0.03x0.06",
+    "cylinder:0.04x0.06",
+    "sphere:0.04",
+    "capsule:0.03x0.06",
+)
 shapes = st.sampled_from(SHAPES)
 yaws = st.floats(-math.pi, math.pi)
 
@@ -35,7 +41,9 @@ def turned(world: World, yaw: float, up: int) -> Lie:
     """The object on the table, its own axis `up` upwards, turned about the vertical."""
     upwards = ([0.5**0.5, 0, -(0.5**0.5), 0], [0.5**0.5, 0.5**0.5, 0, 0], [1, 0, 0, 0])[up]
     quaternion = np.empty(4)
-    mujoco.mju_mulQuat(quaternion, np.array([math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]), np.array(upwards, float))
+    mujoco.mju_mulQuat(
+        quaternion, np.array([math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]), np.array(upwards, float)
+    )
     world.place(OBJECT, np.array([0.5, 0.0, world.extents(OBJECT)[up] / 2]), quaternion)
     world.update()
     return lie_of(world, OBJECT)
@@ -49,7 +57,11 @@ def span(world: World, direction: np.ndarray) -> float:
         return float(np.abs(axes) @ lengths)
     across = float(np.hypot(axes[0], axes[1])) if kind != mujoco.mjtGeom.mjGEOM_CAPSULE else 1.0
     length = lengths[2] - (lengths[0] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0)
-    return float(across * lengths[0] + abs(axes[2]) * length) if kind != mujoco.mjtGeom.mjGEOM_SPHERE else lengths[0]
+    return (
+        float(across * lengths[0] + abs(axes[2]) * length)
+        if kind != mujoco.mjtGeom.mjGEOM_SPHERE
+        else lengths[0]
+    )
 
 
 @given(shapes, yaws, st.integers(0, 2))
@@ -80,8 +92,14 @@ def test_a_cube_is_observed_as_ever_and_other_shapes_with_their_lengths():
         len(environment_state_names(make_env().scene))
         == len(environment_state_names(world_of("sphere:0.04").scene)) - 3
     )
-    cube = [name for name in environment_state_names(make_env(object="box:0.03").scene) if name.startswith(OBJECT)]
-    assert cube == [name for name in environment_state_names(make_env().scene) if name.startswith(OBJECT)]
+    cube = [
+        name
+        for name in environment_state_names(make_env(object="box:0.03").scene)
+        if name.startswith(OBJECT)
+    ]
+    assert cube == [
+        name for name in environment_state_names(make_env().scene) if name.startswith(OBJECT)
+    ]
     assert {"object.folds", "object.width", "object.length", "object.height"} < set(
         environment_state_names(world_of("capsule:0.03x0.06").scene)
     )
@@ -96,7 +114,9 @@ def test_a_cube_is_observed_as_ever_and_other_shapes_with_their_lengths():
         ("capsule:0.03x0.06", {0.03}),
     ],
 )
-def test_starts_lie_and_stand_where_the_shape_has_it_and_at_any_yaw(shape: str, heights: set[float]):
+def test_starts_lie_and_stand_where_the_shape_has_it_and_at_any_yaw(
+    shape: str, heights: set[float]
+):
     yaws, found = [], set()
     for seed in range(SEED, SEED + 40):
         env = started(seed=seed, object=shape)
@@ -112,7 +132,8 @@ def test_starts_lie_and_stand_where_the_shape_has_it_and_at_any_yaw(shape: str, 
 
 
 @pytest.mark.parametrize(
-    "shape", ["box:0.06x0.04x0.02", "cylinder:0.02", "cylinder:0.06", "sphere:0.02", "capsule:0.06", "any"]
+    "shape",
+    ["box:0.06x0.04x0.02", "cylinder:0.02", "cylinder:0.06", "sphere:0.02", "capsule:0.06", "any"],
 )
 @pytest.mark.parametrize("task", ["pick_place", "lift"])
 def test_the_expert_brings_any_shape_to_its_goal(task: str, shape: str):

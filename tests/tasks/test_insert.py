@@ -1,4 +1,6 @@
-"""The task `insert`: where the peg starts, how the hand turns it, and that it ends up in the hole."""
+"""The task `insert`: where the peg starts, how the hand turns it, and that it ends up in the
+hole.
+"""
 
 import math
 

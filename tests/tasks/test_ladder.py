@@ -29,7 +29,8 @@ OPEN, EDGE = 0.08, 0.05  # of the hand; of the cube where a test says no other [
 LOWEST = 0.021  # of the hand over the table [m]
 EDGES = (0.03, 0.05, 0.07)
 RUNGS = pick_rungs("object")
-UPRIGHT = Reach(np.array([-1.0, -1.0, -1.0]), np.zeros((41, 41, 41)))  # the hand gets everywhere pointing down
+# the hand gets everywhere pointing down
+UPRIGHT = Reach(np.array([-1.0, -1.0, -1.0]), np.zeros((41, 41, 41)))
 LEANING = Reach(UPRIGHT.origin, np.ones((41, 41, 41)))  # nowhere
 widths = st.floats(0.03, 0.07)
 steepest = 60.0  # change of a target per change of where the hand is
@@ -49,7 +50,9 @@ class Placed:
     reach: Reach = UPRIGHT
     resting: bool = False
     gripper: ClassVar[Any] = SimpleNamespace(most=OPEN, lopsided=False, middle=lambda opening: 0.0)
-    robot: ClassVar[Any] = SimpleNamespace(ee=SimpleNamespace(lowest=LOWEST), leans=False, faces_ahead=False)
+    robot: ClassVar[Any] = SimpleNamespace(
+        ee=SimpleNamespace(lowest=LOWEST), leans=False, faces_ahead=False
+    )
 
     @property
     def hand_yaw(self) -> float:
@@ -99,11 +102,24 @@ def about(axis: tuple[float, float, float], angle: float) -> np.ndarray:
     return matrix.reshape(3, 3)
 
 
-def at(x: float, y: float, z: float, yaw: float = 0.0, tilt: float = 0.0, edge: float = EDGE, **changes: Any) -> Placed:
-    """The hand, pointing down and turned by `yaw`, by this much off a cube that rests on the table; wide open."""
+def at(
+    x: float,
+    y: float,
+    z: float,
+    yaw: float = 0.0,
+    tilt: float = 0.0,
+    edge: float = EDGE,
+    **changes: Any,
+) -> Placed:
+    """The hand, pointing down and turned by `yaw`, by this much off a cube that rests on the table.
+
+    Wide open.
+    """
     cube = np.array([0.5, 0.1, edge / 2])
     hand = Pose(cube + [x, y, z], hand_down(yaw))
-    return Placed(hand, Pose(cube, about((1, 0, 0), tilt)), np.array([0.4, -0.1, 0.2]), edge=edge, **changes)
+    return Placed(
+        hand, Pose(cube, about((1, 0, 0), tilt)), np.array([0.4, -0.1, 0.2]), edge=edge, **changes
+    )
 
 
 def turned(rotation: np.ndarray, **changes: Any) -> Placed:
@@ -112,10 +128,14 @@ def turned(rotation: np.ndarray, **changes: Any) -> Placed:
     return replace(world, cube=Pose(world.cube.position, rotation))
 
 
-@pytest.mark.parametrize(("reach", "lean", "phase"), [(UPRIGHT, 0.0, "descend"), (LEANING, 1.0, "grasp")])
+@pytest.mark.parametrize(
+    ("reach", "lean", "phase"), [(UPRIGHT, 0.0, "descend"), (LEANING, 1.0, "grasp")]
+)
 def test_a_hand_may_lean_where_it_does_not_get_upright(reach: Reach, lean: float, phase: str):
     world = at(0, 0, 0, reach=reach)
-    leaning = replace(world, ee=Pose(world.ee.position, about((0, 1, 0), 0.9 * LEAN) @ world.ee.rotation))
+    leaning = replace(
+        world, ee=Pose(world.ee.position, about((0, 1, 0), 0.9 * LEAN) @ world.ee.rotation)
+    )
     name, target = rung(leaning)
     assert (name, target.lean) == (phase, lean)
 
@@ -129,7 +149,9 @@ def cube_yaw(rotation: np.ndarray) -> tuple[float, float]:
 def held(to_goal: tuple[float, float, float], edge: float = EDGE) -> Placed:
     """The cube in the hand, and the goal that far from it."""
     cube = np.array([0.5, 0.1, 0.15])
-    return Placed(Pose(cube, hand_down(0.0)), Pose(cube, np.eye(3)), cube + to_goal, edge, edge, touching=True)
+    return Placed(
+        Pose(cube, hand_down(0.0)), Pose(cube, np.eye(3)), cube + to_goal, edge, edge, touching=True
+    )
 
 
 def rung(world: Placed, rungs: tuple[Rung, ...] = RUNGS) -> tuple[str, Target]:
@@ -147,19 +169,28 @@ def top(world: Placed) -> float:
     [
         (at(-0.2, 0.1, 0.2), "approach", OPEN, [0.5, 0.1, EDGE + HOVER]),
         (at(0, 0, 0.08), "descend", OPEN, [0.5, 0.1, EDGE / 2]),  # all the way
-        *((at(0.003, -0.003, 0.004, edge=e), "grasp", 0.0, [0.5, 0.1, max(e / 2, LOWEST)]) for e in EDGES),
-        *((held((-0.2, 0.1, 0.0), e), "carry", 0.0, [0.3, 0.2, 0.2]) for e in EDGES),  # over the goal first
-        *((held((-0.01, 0.0, -0.05), e), "carry", 0.0, [0.49, 0.1, 0.1]) for e in EDGES),  # and then down
+        *(
+            (at(0.003, -0.003, 0.004, edge=e), "grasp", 0.0, [0.5, 0.1, max(e / 2, LOWEST)])
+            for e in EDGES
+        ),
+        # over the goal first
+        *((held((-0.2, 0.1, 0.0), e), "carry", 0.0, [0.3, 0.2, 0.2]) for e in EDGES),
+        # and then down
+        *((held((-0.01, 0.0, -0.05), e), "carry", 0.0, [0.49, 0.1, 0.1]) for e in EDGES),
     ],
 )
-def test_the_ladder_leads_to_the_goal(world: Placed, name: str, opening: float, position: list[float]):
+def test_the_ladder_leads_to_the_goal(
+    world: Placed, name: str, opening: float, position: list[float]
+):
     found, target = rung(world)
     assert (found, target.opening) == (name, opening)
     np.testing.assert_allclose(target.position, position)
 
 
 @given(st.floats(0.06, 0.2), st.floats(0, 2 * np.pi), st.floats(-0.02, 0.04), widths)
-def test_beside_the_object_a_hand_that_is_too_low_only_rises(off: float, direction: float, height: float, edge: float):
+def test_beside_the_object_a_hand_that_is_too_low_only_rises(
+    off: float, direction: float, height: float, edge: float
+):
     world = at(off * np.cos(direction), off * np.sin(direction), height, edge=edge)
     _, target = rung(world)
     np.testing.assert_array_equal(target.position[:2], world.ee.position[:2])
@@ -170,7 +201,9 @@ def test_beside_the_object_a_hand_that_is_too_low_only_rises(off: float, directi
     st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.01, 0.2), widths, st.sampled_from([0.0, 0.2, OPEN]),
     st.lists(st.floats(-1, 1), min_size=3, max_size=3),
 )  # fmt: skip
-def test_within_a_rung_targets_are_continuous(x, y, z, edge: float, opening: float, way: list[float]):
+def test_within_a_rung_targets_are_continuous(
+    x, y, z, edge: float, opening: float, way: list[float]
+):
     world = at(x, y, z, edge=edge, opening=opening)
     near = world.moved(*(1e-5 * np.array(way)))
     (name, target), (other, beside) = rung(world), rung(near)
@@ -195,18 +228,24 @@ def test_fingers_that_touch_the_cube_between_them_hold_it_and_others_do_not():
     assert rung(at(0, 0, 0.07, opening=EDGE, touching=True))[0] != "carry"
 
 
-@pytest.mark.parametrize(("way", "yaw"), [((0.03, 0.0), 0.0), ((0.0, 0.03), np.pi / 2), ((0.0, -0.07), 0.0)])
+@pytest.mark.parametrize(
+    ("way", "yaw"), [((0.03, 0.0), 0.0), ((0.0, 0.03), np.pi / 2), ((0.0, -0.07), 0.0)]
+)
 def test_the_fingers_go_down_where_no_neighbour_stands(way: tuple[float, float], yaw: float):
     world = at(0, 0, 0.1, around=(way,))
     assert abs(grasp_of(world, "object").yaw) == pytest.approx(yaw)
 
 
 def tipped(z: float, tilt: float, turn: float = 0.0, **changes: Any) -> Placed:
-    """The hand over a cube that stands on an edge, turned as a grasp of its upright sides wants it."""
+    """The hand over a cube that stands on an edge, turned as a grasp of its upright sides wants
+    it.
+    """
     world = at(0, 0, z, yaw=np.pi / 2, **changes)
     rotation = about((0, 0, 1), turn)
     hand = Pose(world.ee.position, rotation @ world.ee.rotation)
-    return replace(world, ee=hand, cube=Pose(world.cube.position, rotation @ about((1, 0, 0), tilt)))
+    return replace(
+        world, ee=hand, cube=Pose(world.cube.position, rotation @ about((1, 0, 0), tilt))
+    )
 
 
 def test_over_an_object_that_tips_over_the_hand_waits_and_between_the_fingers_it_is_grasped():
@@ -216,7 +255,9 @@ def test_over_an_object_that_tips_over_the_hand_waits_and_between_the_fingers_it
 
 
 @given(st.floats(MAX_TILT + 0.02, np.pi / 2 - MAX_TILT - 0.02), st.floats(-np.pi, np.pi), widths)
-def test_an_object_that_leans_on_something_is_gripped_by_its_upright_sides(tilt: float, turn: float, edge: float):
+def test_an_object_that_leans_on_something_is_gripped_by_its_upright_sides(
+    tilt: float, turn: float, edge: float
+):
     leaning = tipped(0.06, tilt, turn, edge=edge, resting=True)
     over = replace(leaning, ee=Pose(leaning.ee.position, rung(leaning)[1].rotation))
     name, target = rung(over)
@@ -225,7 +266,14 @@ def test_an_object_that_leans_on_something_is_gripped_by_its_upright_sides(tilt:
     assert abs(float(target.rotation[:, 1] @ leaning.cube.rotation[:, 0])) == pytest.approx(1.0)
 
 
-@given(st.floats(0, 0.2), st.floats(0, 2 * np.pi), st.floats(-0.02, 0.3), st.floats(0, OPEN), widths, st.booleans())
+@given(
+    st.floats(0, 0.2),
+    st.floats(0, 2 * np.pi),
+    st.floats(-0.02, 0.3),
+    st.floats(0, OPEN),
+    widths,
+    st.booleans(),
+)
 def test_no_target_is_in_the_table(
     off: float, direction: float, height: float, opening: float, edge: float, touching: bool
 ):
@@ -239,7 +287,9 @@ def test_no_target_is_in_the_table(
 @given(
     st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.02, 0.4), st.floats(0, OPEN), widths, st.floats(-3, 3)
 )  # fmt: skip
-def test_progress_is_a_share_and_holding_is_more_than_any_way_to_it(x, y, z, opening: float, edge: float, yaw: float):
+def test_progress_is_a_share_and_holding_is_more_than_any_way_to_it(
+    x, y, z, opening: float, edge: float, yaw: float
+):
     free = pick_progress(at(x, y, z, yaw, edge=edge, opening=opening), "object")
     assert 0 < free < 0.5 <= pick_progress(held((x, y, z), edge), "object") <= 1
 
@@ -252,7 +302,9 @@ def test_a_grasp_is_one_of_the_cubes_own_and_no_far_turn(object_yaw: float, hand
 
 
 @given(st.floats(-np.pi, np.pi), st.lists(st.floats(-1, 1), min_size=4, max_size=4))
-def test_the_angle_from_a_hand_that_points_down_is_the_angle_between_the_two(yaw: float, numbers: list[float]):
+def test_the_angle_from_a_hand_that_points_down_is_the_angle_between_the_two(
+    yaw: float, numbers: list[float]
+):
     assume(np.linalg.norm(numbers) > 0.1)
     hand = np.empty(9)
     mujoco.mju_quat2Mat(hand, np.array(numbers) / np.linalg.norm(numbers))
@@ -279,7 +331,12 @@ def test_a_resting_cubes_yaw_does_not_know_the_face_it_lies_on(yaw: float, symme
     assert turned[1] == pytest.approx(0, abs=1e-6)
 
 
-@given(st.floats(-np.pi, np.pi), st.floats(0, 2 * np.pi), st.floats(0, 0.3), st.sampled_from(SYMMETRIES))
+@given(
+    st.floats(-np.pi, np.pi),
+    st.floats(0, 2 * np.pi),
+    st.floats(0, 0.3),
+    st.sampled_from(SYMMETRIES),
+)
 def test_a_tilted_cubes_tilt_does_not_know_its_face_and_its_yaw_hardly(
     yaw: float, direction: float, tilt: float, symmetry: np.ndarray
 ):
@@ -288,5 +345,6 @@ def test_a_tilted_cubes_tilt_does_not_know_its_face_and_its_yaw_hardly(
     assert turned[1] == pytest.approx(plain[1], abs=1e-6)
     assert plain[1] == pytest.approx(tilt, abs=1e-6)
     apart = np.angle(np.exp(4j * (turned[0] - plain[0]))) / 4
-    between = 2 * np.arctan(np.cos(tilt))  # two sides, a right angle apart, seen from above at worst
+    # two sides, a right angle apart, seen from above at worst
+    between = 2 * np.arctan(np.cos(tilt))
     assert abs(apart) <= np.pi / 2 - between + 1e-6

@@ -1,4 +1,6 @@
-"""Objects that are meshes: read from a file, grasped on any side that they rest on, named in data without a path."""
+"""Objects that are meshes: read from a file, grasped on any side that they rest on, named in
+data without a path.
+"""
 
 import pickle
 from dataclasses import replace
@@ -44,14 +46,22 @@ def text(folder: Path, name: str) -> str:
     ("name", "robot"), [*((name, "panda") for name in MESHES), ("mug", "so101"), ("angle", "so101")]
 )
 def test_the_expert_brings_it_to_its_goal(name, robot, folder):
-    episodes = RolloutJob(make_config(robot, object=text(folder, name)), hold=0).run(range(3_000_000, 3_000_003))
+    episodes = RolloutJob(make_config(robot, object=text(folder, name)), hold=0).run(
+        range(3_000_000, 3_000_003)
+    )
     assert all(episode.success for episode in episodes)
 
 
 @pytest.mark.parametrize("task", ["lift", "carry"])
 def test_other_tasks_take_it_too(task, folder):
     config = make_config("panda", task, object=text(folder, "mug"))
-    assert sum(episode.success for episode in RolloutJob(config, hold=0).run(range(3_000_000, 3_000_003))) >= 2
+    assert (
+        sum(
+            episode.success
+            for episode in RolloutJob(config, hold=0).run(range(3_000_000, 3_000_003))
+        )
+        >= 2
+    )
 
 
 @pytest.mark.parametrize("ending", [".stl", ".obj", ".ascii.stl"])
@@ -60,15 +70,23 @@ def test_every_kind_of_file_is_the_same_solid(ending, tmp_path):
     solid.export(path, file_type="stl_ascii" if "ascii" in ending else None)
     shape = ObjectShape.parse(Path(f"mesh:{path}:0.05"))
     assert max(shape.lengths) == pytest.approx(0.05)
-    assert shape.mass == pytest.approx(max(LIGHTEST, DENSITY * solid.volume * (0.05 / 0.07) ** 3), rel=1e-5)
-    np.testing.assert_allclose(shape.mesh.vertices.min(axis=0), np.array((-0.0275, -0.0225, -0.0125)) / 1.4, atol=1e-6)
+    assert shape.mass == pytest.approx(
+        max(LIGHTEST, DENSITY * solid.volume * (0.05 / 0.07) ** 3), rel=1e-5
+    )
+    np.testing.assert_allclose(
+        shape.mesh.vertices.min(axis=0), np.array((-0.0275, -0.0225, -0.0125)) / 1.4, atol=1e-6
+    )
 
 
 def test_the_model_has_its_mass_its_centre_of_mass_and_its_picture(folder):
     bottle = Path(text(folder, "bottle"))
     shape, scene = ObjectShape.parse(bottle), scene_of("panda", "pick_place", bottle)
     one, model = scene.objects[OBJECT], scene.model
-    assert model.body_mass[one.body] == pytest.approx(shape.mass) == pytest.approx(DENSITY * MESHES["bottle"]().volume)
+    assert (
+        model.body_mass[one.body]
+        == pytest.approx(shape.mass)
+        == pytest.approx(DENSITY * MESHES["bottle"]().volume)
+    )
     np.testing.assert_allclose(model.body_ipos[one.body], 0, atol=1e-5)
     assert model.mesh_facenum[model.geom_dataid[one.geom]] == len(MESHES["bottle"]().faces)
 
@@ -109,7 +127,9 @@ def test_a_side_that_is_too_wide_has_no_label_and_says_why(tmp_path):
     plate = make_env("panda", object=f"mesh:{write_mesh('plate', tmp_path)}")
     plate.reset(seed=0)
     settled(plate.world, np.array([1.0, 1.0, 0.0, 0.0]))
-    assert "too low or too wide for the gripper" in Expert(plate.scene).label(plate.get_state()).reason
+    assert (
+        "too low or too wide for the gripper" in Expert(plate.scene).label(plate.get_state()).reason
+    )
 
 
 def test_data_have_its_name_and_hash_and_no_path(folder, tmp_path):
@@ -122,13 +142,21 @@ def test_data_have_its_name_and_hash_and_no_path(folder, tmp_path):
     moved.write_bytes((folder / "mug.obj").read_bytes())
     assert env_fingerprint(make_config("panda", object=f"mesh:{moved}:0.06")) == before
     assert world_of("panda").own_files("panda", "pick_place", spec.object)
-    with pytest.raises(UsageError, match=r"name of the mesh was stored; give --task\.object=mesh:PATH/mug\.obj:0\.06"):
+    with pytest.raises(
+        UsageError,
+        match=r"name of the mesh was stored; give --task\.object=mesh:PATH/mug\.obj:0\.06",
+    ):
         stored_config(spec)
 
 
-def test_a_dataset_and_an_evaluation_of_it_are_used_with_its_file(folder, tmp_path, monkeypatch, capsys):
+def test_a_dataset_and_an_evaluation_of_it_are_used_with_its_file(
+    folder, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
-    mesh, few = text(folder, "bowl"), ["--workers=1", "--eval.n_episodes=2", "--eval.films=0", "--output_dir=e"]
+    mesh, few = (
+        text(folder, "bowl"),
+        ["--workers=1", "--eval.n_episodes=2", "--eval.films=0", "--output_dir=e"],
+    )
     words = ["--dataset.num_episodes=2", "--dataset.root=data", "--workers=1"]
     assert main(["record", f"--task.object={mesh}", *words]) == 0
     assert main(["data", "check", "data"]) == 0
@@ -136,7 +164,16 @@ def test_a_dataset_and_an_evaluation_of_it_are_used_with_its_file(folder, tmp_pa
         open_source(tmp_path / "data")
     assert main(["data", "relabel", "data", f"--task.object={mesh}", "--workers=1"]) == 0
     assert (
-        main(["data", "relabel", "data", f"--task.object={text(folder, 'mug')}", "--workers=1", "--overwrite=true"])
+        main(
+            [
+                "data",
+                "relabel",
+                "data",
+                f"--task.object={text(folder, 'mug')}",
+                "--workers=1",
+                "--overwrite=true",
+            ]
+        )
         == 1
     )
     capsys.readouterr()
@@ -152,8 +189,12 @@ def test_a_node_gets_the_file(folder, tmp_path):
     job = RolloutJob(make_config("panda", object=f"mesh:{path}"), hold=0)
     [here], files = list(job.run([5])), {"wedge.obj": path.read_bytes()}
     path.unlink()
-    away = replace(job, env=replace(job.env, object=Path(f"mesh:{tmp_path / 'elsewhere' / 'wedge.obj'}")))
-    [(there, _)] = pickle.loads(zstandard.decompress(run_there(manip_il.__version__, away, (5,), None, None, files)))
+    away = replace(
+        job, env=replace(job.env, object=Path(f"mesh:{tmp_path / 'elsewhere' / 'wedge.obj'}"))
+    )
+    [(there, _)] = pickle.loads(
+        zstandard.decompress(run_there(manip_il.__version__, away, (5,), None, None, files))
+    )
     for name, column in here.without_pictures().columns.items():
         np.testing.assert_array_equal(there.columns[name], column)
 
@@ -176,13 +217,23 @@ MISTAKES = {
         "own.stl",
         "rests 0.008 m high (0.012 m is the least",
     ),
-    "has no triangles": (lambda path: path.write_text("o nothing\n"), "own.obj", "own.obj is empty"),
+    "has no triangles": (
+        lambda path: path.write_text("o nothing\n"),
+        "own.obj",
+        "own.obj is empty",
+    ),
     "has no bytes": (lambda path: path.write_bytes(b""), "own.stl", "own.stl is empty"),
-    "is in millimetres": (trimesh.creation.box((50, 40, 30)).export, "own.stl", "is 50 m long; expected 0.02 to 0.2 m"),
+    "is in millimetres": (
+        trimesh.creation.box((50, 40, 30)).export,
+        "own.stl",
+        "is 50 m long; expected 0.02 to 0.2 m",
+    ),
 }
 
 
-@pytest.mark.parametrize("command", [["eval", "--policy.type=expert", "--output_dir=out"], ["record"]])
+@pytest.mark.parametrize(
+    "command", [["eval", "--policy.type=expert", "--output_dir=out"], ["record"]]
+)
 @pytest.mark.parametrize("case", MISTAKES)
 def test_a_mesh_that_cannot_be_used_is_one_line(case, command, tmp_path, monkeypatch, capsys):
     write, name, says = MISTAKES[case]

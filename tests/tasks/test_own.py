@@ -1,4 +1,6 @@
-"""A task from a file: it runs in every command that names its path, and never because data name it."""
+"""A task from a file: it runs in every command that names its path, and never because data name
+it.
+"""
 
 import pickle
 import re
@@ -71,7 +73,10 @@ class Tin(PickPlace):
 
 def test_an_own_object_is_replaced_by_the_one_that_is_asked_for(tmp_path):
     (tmp_path / "own.py").write_text(CYLINDER)
-    asked = {name: make_config("panda", str(tmp_path / "own.py"), object=name) for name in ("", "box:0.05", "sphere")}
+    asked = {
+        name: make_config("panda", str(tmp_path / "own.py"), object=name)
+        for name in ("", "box:0.05", "sphere")
+    }
     assert [one.object for one in asked.values()] == ["", "box:0.05", "sphere:0.05"]
     assert make_config("panda", str(tmp_path / "own.py"), object="cylinder:0.04x0.06") == asked[""]
 
@@ -114,7 +119,9 @@ def test_what_is_written_of_it_has_its_name_and_hash_and_no_path(touch):
     changed.parent.mkdir()
     changed.write_text(f"{TOUCH}\n# more\n")
     differing = {
-        key for key, value in env_fingerprint(make_config("panda", str(changed))).items() if value != before[key]
+        key
+        for key, value in env_fingerprint(make_config("panda", str(changed))).items()
+        if value != before[key]
     }
     assert differing == {"task_sha256"}
 
@@ -136,13 +143,30 @@ def test_data_and_results_name_a_task_and_run_nothing(touch, tmp_path, monkeypat
     assert main(["eval", "e", "--replay=4000000", f"--task.type={touch}"]) == 0
 
 
-def test_a_policy_of_it_is_evaluated_by_its_path_without_a_warning(touch, tmp_path, monkeypatch, capsys):
+def test_a_policy_of_it_is_evaluated_by_its_path_without_a_warning(
+    touch, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
-    words = ["--demonstrations=2", "--rounds=1", "--episodes_per_round=2", "--steps=20", "--policy.width=16",
-             "--validation_episodes=2", "--env.horizon=40", "--workers=1", "--output_dir=run"]  # fmt: skip
+    words = [
+        "--demonstrations=2",
+        "--rounds=1",
+        "--episodes_per_round=2",
+        "--steps=20",
+        "--policy.width=16",
+        "--validation_episodes=2",
+        "--env.horizon=40",
+        "--workers=1",
+        "--output_dir=run",
+    ]
     assert main(["dagger", f"--task.type={touch}", *words]) == 0
     capsys.readouterr()
-    last = ["--policy.path=run/best", "--eval.n_episodes=2", "--eval.films=0", "--workers=1", "--output_dir=e"]
+    last = [
+        "--policy.path=run/best",
+        "--eval.n_episodes=2",
+        "--eval.films=0",
+        "--workers=1",
+        "--output_dir=e",
+    ]
     assert main(["eval", *last]) == 2
     assert "give --task.type=FILE.py" in capsys.readouterr().err
     assert main(["eval", f"--task.type={touch}", "--env.horizon=40", *last]) == 0
@@ -185,7 +209,17 @@ def test_a_file_that_holds_no_task_is_one_line(case, tmp_path, capsys):
     content, says = MISTAKES[case]
     path = tmp_path / "own.py"
     path.write_text(content)
-    assert main(["eval", "--policy.type=expert", f"--task.type={path}", f"--output_dir={tmp_path / 'e'}"]) == 2
+    assert (
+        main(
+            [
+                "eval",
+                "--policy.type=expert",
+                f"--task.type={path}",
+                f"--output_dir={tmp_path / 'e'}",
+            ]
+        )
+        == 2
+    )
     error = capsys.readouterr().err
     assert (error.count("\n"), says in error) == (1, True), error
 
@@ -193,11 +227,23 @@ def test_a_file_that_holds_no_task_is_one_line(case, tmp_path, capsys):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_bug_in_a_task_names_its_file_line_and_function(workers, tmp_path, capsys):
     path = tmp_path / "own.py"
-    path.write_text(TOUCH.replace("return math.dist(world.ee.position[:2]", "return math.dits(world.ee.position[:2]"))
-    words = ["--policy.type=expert", f"--task.type={path}", f"--output_dir={tmp_path / 'e'}", f"--workers={workers}"]
+    path.write_text(
+        TOUCH.replace(
+            "return math.dist(world.ee.position[:2]", "return math.dits(world.ee.position[:2]"
+        )
+    )
+    words = [
+        "--policy.type=expert",
+        f"--task.type={path}",
+        f"--output_dir={tmp_path / 'e'}",
+        f"--workers={workers}",
+    ]
     assert main(["eval", *words]) == 1
     error = capsys.readouterr().err.splitlines()[-1]
-    assert re.search(r"own\.py, line \d+ \(beside\): AttributeError: module 'math' has no attribute 'dits'", error)
+    assert re.search(
+        r"own\.py, line \d+ \(beside\): AttributeError: module 'math' has no attribute 'dits'",
+        error,
+    )
 
 
 def test_a_package_brings_names(touch, monkeypatch):
@@ -209,7 +255,9 @@ def test_a_package_brings_names(touch, monkeypatch):
         def load(self) -> type:
             return cls
 
-    monkeypatch.setattr(table, "entry_points", lambda group, name: [Entry()] if name == "touch" else [])
+    monkeypatch.setattr(
+        table, "entry_points", lambda group, name: [Entry()] if name == "touch" else []
+    )
     table._named.cache_clear()
     assert get_task("touch").instruction == "Touch the top of the cube."
     with pytest.raises(UnknownName, match="the path of a Python file"):
@@ -227,7 +275,11 @@ def test_a_package_brings_robots_or_is_refused_in_one_line(monkeypatch):
             return self._place
 
     brought = {"my_arm": Entry(ROBOTS["panda"]), "broken": Entry(3)}
-    monkeypatch.setattr(robots, "entry_points", lambda group, name: [brought[name]] if name in brought else [])
+    monkeypatch.setattr(
+        robots, "entry_points", lambda group, name: [brought[name]] if name in brought else []
+    )
     assert robots.get_robot("my_arm") == robots.get_robot("panda")
-    with pytest.raises(UsageError, match=r"robot broken of my_lab\.robots:ARM: .*; expected the path of a YAML"):
+    with pytest.raises(
+        UsageError, match=r"robot broken of my_lab\.robots:ARM: .*; expected the path of a YAML"
+    ):
         robots.get_robot("broken")

@@ -1,4 +1,6 @@
-"""Sort: what is named is a function of the state, in words and in numbers, and the other cubes are left alone."""
+"""Sort: what is named is a function of the state, in words and in numbers, and the other cubes
+are left alone.
+"""
 
 from functools import cache
 
@@ -39,7 +41,9 @@ def others(world: World) -> list[str]:
 
 
 def test_every_cube_is_named_in_every_sentence():
-    assert {text for _, text, _ in starts()} == {text.format(colour=colour) for text in SENTENCES for colour in COLOURS}
+    assert {text for _, text, _ in starts()} == {
+        text.format(colour=colour) for text in SENTENCES for colour in COLOURS
+    }
     assert all(name in text for name, text, _ in starts())
 
 
@@ -50,10 +54,14 @@ def test_a_restored_state_says_the_same_in_words_and_numbers():
         seen = env.observe()
         assert (asked(env.world), seen.instruction, env.task_description) == (name, text, text)
         numbers = dict(zip(names, seen.environment_state.tolist(), strict=True))
-        assert [numbers[f"asked.{colour}"] for colour in COLOURS] == [colour == name for colour in COLOURS]
+        assert [numbers[f"asked.{colour}"] for colour in COLOURS] == [
+            colour == name for colour in COLOURS
+        ]
         cube, bin_at = (env.world.pose(one).position for one in (name, BINS[name]))
         np.testing.assert_allclose(
-            [numbers[f"cube_from_ee.{axis}"] for axis in "xyz"], cube - env.world.ee.position, atol=1e-6
+            [numbers[f"cube_from_ee.{axis}"] for axis in "xyz"],
+            cube - env.world.ee.position,
+            atol=1e-6,
         )
         np.testing.assert_allclose(numbers["bin_from_cube.x"], bin_at[0] - cube[0], atol=1e-6)
 
@@ -68,7 +76,10 @@ def test_a_knock_moves_the_cube_that_is_named():
 
 
 def test_redrawn_bins_stand_in_a_row():
-    drawer, env = SceneDrawer(make_config("panda", "sort"), Scenes(None, 20)), make_env("panda", "sort")
+    drawer, env = (
+        SceneDrawer(make_config("panda", "sort"), Scenes(None, 20)),
+        make_env("panda", "sort"),
+    )
     for number, (_, _, state) in enumerate(starts()[:20]):
         for frame in drawer.frames(state, number, 0):
             env.set_state(frame.state)
@@ -88,7 +99,10 @@ def test_an_episodes_text_is_that_of_its_state(robot: str):
 @every_large_robot
 def test_the_cube_that_is_named_ends_in_its_bin_and_the_others_where_they_were(robot: str):
     env = started(robot, "sort")
-    expert, before = Expert(env.scene), {name: env.world.pose(name).position.copy() for name in COLOURS}
+    expert, before = (
+        Expert(env.scene),
+        {name: env.world.pose(name).position.copy() for name in COLOURS},
+    )
     while not env.solved:
         assert env.get_state().step < env.config.horizon
         env.advance(expert.label(env.get_state()).action)

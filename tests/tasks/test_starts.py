@@ -45,7 +45,9 @@ def position(drawn: Start, name: str) -> np.ndarray:
 @every_scene
 @given(edge=edges, seed=seeds)
 @settings(max_examples=20)
-def test_everything_that_is_drawn_is_within_reach(robot: str, task: str, edge: float | None, seed: int):
+def test_everything_that_is_drawn_is_within_reach(
+    robot: str, task: str, edge: float | None, seed: int
+):
     world = world_of(robot, task, edge)
     poses = start(world, seed).poses
     assert (GOAL in poses) == has_goal(world)
@@ -59,7 +61,9 @@ def test_everything_that_is_drawn_is_within_reach(robot: str, task: str, edge: f
 @every_scene_that_grasps
 @given(edge=edges, seed=seeds)
 @settings(max_examples=20)
-def test_an_object_rests_on_the_table_and_not_under_the_hand(robot: str, task: str, edge: float | None, seed: int):
+def test_an_object_rests_on_the_table_and_not_under_the_hand(
+    robot: str, task: str, edge: float | None, seed: int
+):
     world = world_of(robot, task, edge)
     space, drawn = world.scene.robot.workspace, start(world, seed)
     for name in get_task(task).objects:
@@ -76,7 +80,10 @@ def test_an_object_rests_on_the_table_and_not_under_the_hand(robot: str, task: s
 @every_scene
 def test_a_start_has_no_contact_but_of_what_rests(robot: str, task: str):
     env = make_env(robot, task)
-    objects, table = {one.geom for one in env.scene.objects.values()}, env.scene.model.geom("table").id
+    objects, table = (
+        {one.geom for one in env.scene.objects.values()},
+        env.scene.model.geom("table").id,
+    )
     for seed in range(SEED, SEED + 20):
         env.start(seed)
         for contact in env.data.contact:

@@ -5,7 +5,15 @@ import itertools
 import numpy as np
 import pytest
 
-from manip_il.chapter.theory.bounds import PROCESSES, RIGHT, WRONG, Process, clone, curves, losses_of
+from manip_il.chapter.theory.bounds import (
+    PROCESSES,
+    RIGHT,
+    WRONG,
+    Process,
+    clone,
+    curves,
+    losses_of,
+)
 
 FEW = (10, 40, 160)
 
@@ -23,7 +31,14 @@ def small(seed: int = 0) -> Process:
     leads[..., 0] = True
     rewards = rng.random((2, 3))
     rewards[WRONG] *= rewards[RIGHT]
-    return Process("small", "", leads / leads.sum(axis=2, keepdims=True), rewards, np.array([0.5, 0.2, 0.3]), (0, 0))
+    return Process(
+        "small",
+        "",
+        leads / leads.sum(axis=2, keepdims=True),
+        rewards,
+        np.array([0.5, 0.2, 0.3]),
+        (0, 0),
+    )
 
 
 def returns(process: Process, policy: np.ndarray) -> float:
@@ -51,7 +66,10 @@ def test_the_gap_is_the_difference_of_returns_over_all_paths():
 
 def test_trajectories_are_where_the_policy_is_and_the_same_seed_draws_the_same(process):
     policy = np.full((2, 6, process.states), 0.3)
-    seen = [process.seen(policy, 4_000, [np.random.default_rng(seed) for seed in (5, 6)]) for _ in range(2)]
+    seen = [
+        process.seen(policy, 4_000, [np.random.default_rng(seed) for seed in (5, 6)])
+        for _ in range(2)
+    ]
     assert (seen[0] == seen[1]).all()
     assert (seen[0] == (process.visits(policy) > 1e-12)).mean() > 0.999
 

@@ -1,4 +1,7 @@
-"""An error that a clone does not correct goes the way of the open loop; noise on the demonstrations mends it."""
+"""An error that a clone does not correct goes the way of the open loop.
+
+Noise on the demonstrations mends it.
+"""
 
 from manip_il.chapter.theory.linear import GUST, drifts
 

@@ -1,4 +1,6 @@
-"""The two arms of gym_aloha: as gymnasium makes them, restored bit for bit, and solved by their experts."""
+"""The two arms of gym_aloha: as gymnasium makes them, restored bit for bit, and solved by their
+experts.
+"""
 
 import re
 from pathlib import Path
@@ -37,13 +39,24 @@ def theirs(task: str) -> Any:
 
 
 def solve(env: AlohaEnv, noise: float = 0.0, seed: int = 0) -> tuple[list[State], bool]:
-    """The states of the expert's episode from where `env` is, up to its success; a share of the actions is random."""
-    expert, rng, states = make_expert(config(env.task.name)), np.random.default_rng(seed), list[State]()
+    """The states of the expert's episode from where `env` is, up to its success.
+
+    A share of the actions is random.
+    """
+    expert, rng, states = (
+        make_expert(config(env.task.name)),
+        np.random.default_rng(seed),
+        list[State](),
+    )
     solved = False
     while not solved and len(states) < 400:
         states.append(env.get_state())
         random = rng.random() < noise
-        action = env.actions.random_near(env.measured(), rng) if random else expert.label(states[-1]).action
+        action = (
+            env.actions.random_near(env.measured(), rng)
+            if random
+            else expert.label(states[-1]).action
+        )
         solved = env.step(action).solved
     return states, solved
 
@@ -51,7 +64,8 @@ def solve(env: AlohaEnv, noise: float = 0.0, seed: int = 0) -> tuple[list[State]
 @every_task
 def test_it_is_the_environment_that_gymnasium_makes(task: str):
     other, ours, expert = theirs(task), AlohaEnv(task), make_expert(config(task))
-    other.unwrapped._env.physics.render = lambda **_: np.zeros((480, 640, 3), np.uint8)  # a second each
+    # a second each
+    other.unwrapped._env.physics.render = lambda **_: np.zeros((480, 640, 3), np.uint8)
     seen, _ = other.reset(seed=4_000_007)
     ours.start(4_000_007)
     for _ in range(60):
@@ -150,7 +164,9 @@ def test_names_and_numbers_are_those_of_lerobots_datasets(task: str):
     assert spec.joint_names[6::7] == ("left_gripper", "right_gripper")
     assert (spec.fps, spec.robot_type or spec.robot, len(spec.joint_names)) == (50, "aloha", 14)
     assert episode.columns["action"].shape[1] == 14
-    assert episode.columns["observation.environment_state"].shape[1] == len(spec.environment_state_names)
+    assert episode.columns["observation.environment_state"].shape[1] == len(
+        spec.environment_state_names
+    )
     assert episode.columns["sim_state"].shape[1] == spec.sim_state_size
     left = episode.columns["observation.state"][:, 6]
     assert 0 <= left.min() < left.max() < 1.1
@@ -161,7 +177,9 @@ def test_names_and_numbers_are_those_of_lerobots_datasets(task: str):
 @every_task
 def test_positions_are_those_of_the_observation(task: str):
     env = AlohaEnv(task)
-    row = dict(zip(env.spec.environment_state_names, env.observe().environment_state.tolist(), strict=True))
+    row = dict(
+        zip(env.spec.environment_state_names, env.observe().environment_state.tolist(), strict=True)
+    )
     found = positions(config(task), env.get_state().to_vector())
     first = next(iter(env.task.objects))
     for name, observed in {"hand": "right_ee", "object": first}.items():
@@ -172,18 +190,27 @@ def test_positions_are_those_of_the_observation(task: str):
 def test_an_episode_ends_as_the_environments_do(task: str):
     job = RolloutJob(config(task), ExpertDriver(), hold=episode_hold(config(task)), label="last")
     [episode] = job.run([3])
-    assert np.array_equal(np.flatnonzero(episode.columns["next.success"].ravel()), [len(episode) - 1])
+    assert np.array_equal(
+        np.flatnonzero(episode.columns["next.success"].ravel()), [len(episode) - 1]
+    )
 
 
 @every_task
-def test_a_redrawn_scene_has_free_objects_elsewhere_and_arms_that_take_along_or_drop_what_they_hold(task: str):
+def test_a_redrawn_scene_has_free_objects_elsewhere_and_arms_that_take_along_or_drop_what_they_hold(
+    task: str,
+):
     env, expert, rng = AlohaEnv(task), make_expert(config(task)), np.random.default_rng(0)
     env.start(4)
     states, _ = solve(env)
     for state in (states[10], states[-20]):
         env.set_state(state)
         before = env.scene()
-        held = {name: side for side in before.hands for name in before.things if any(before.touches(side, name))}
+        held = {
+            name: side
+            for side in before.hands
+            for name in before.things
+            if any(before.touches(side, name))
+        }
         assert len(held) == (0 if state is states[10] else len(env.task.grasped))
         found = [one for _ in range(25) if (one := env.redrawn(state, rng)) is not None]
         moved, anew, kept = 0, 0, list[bool]()
@@ -191,10 +218,15 @@ def test_a_redrawn_scene_has_free_objects_elsewhere_and_arms_that_take_along_or_
             assert expert.label(one).valid
             env.set_state(one)
             after = env.scene()
-            moved += any((after.hands[side].q != before.hands[side].q).any() for side in before.hands)
+            moved += any(
+                (after.hands[side].q != before.hands[side].q).any() for side in before.hands
+            )
             for name, thing in after.things.items():
                 if name in held:
-                    seen = [scene.hands[held[name]].sees(scene.things[name].position) for scene in (before, after)]
+                    seen = [
+                        scene.hands[held[name]].sees(scene.things[name].position)
+                        for scene in (before, after)
+                    ]
                     kept.append(np.allclose(*seen, atol=1e-6))
                 else:
                     anew += bool((thing.position[:2] != before.things[name].position[:2]).all())

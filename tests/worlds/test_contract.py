@@ -1,4 +1,6 @@
-"""The contract of a world, kept by each kind: what is named is there, and what it cannot do it says in one line."""
+"""The contract of a world, kept by each kind: what is named is there, and what it cannot do it
+says in one line.
+"""
 
 import dataclasses
 
@@ -24,7 +26,10 @@ def test_a_spec_says_what_an_environment_gives(robot: str, task: str):
     env.start(stream_seeds("training", 1)[0])
     seen, state = env.observe(), env.get_state()
     assert env.spec == spec == EnvironmentSpec.from_json(spec.to_json())
-    assert (len(spec.joint_names), len(spec.environment_state_names)) == (len(seen.state), len(seen.environment_state))
+    assert (len(spec.joint_names), len(spec.environment_state_names)) == (
+        len(seen.state),
+        len(seen.environment_state),
+    )
     assert len(state.to_vector()) == spec.sim_state_size
     assert (spec.fps, spec.horizon) == (config.control_hz, config.horizon)
     label = make_expert(config).label(state)
@@ -63,5 +68,7 @@ def test_what_it_cannot_do_is_one_line(robot: str, task: str):
 
 def test_what_only_an_environment_has_is_neither_stored_nor_compared():
     spec = env_spec(make_config())
-    bare = dataclasses.replace(spec, can=(), horizon=0, all_cameras=(), default_cameras=(), points=())
+    bare = dataclasses.replace(
+        spec, can=(), horizon=0, all_cameras=(), default_cameras=(), points=()
+    )
     assert (bare, bare.to_json()) == (spec, spec.to_json())

@@ -1,4 +1,6 @@
-"""Fetch's environments: as gymnasium makes them, restored bit for bit, and solved by their experts."""
+"""Fetch's environments: as gymnasium makes them, restored bit for bit, and solved by their
+experts.
+"""
 
 import gymnasium
 import numpy as np
@@ -72,7 +74,10 @@ def test_a_state_of_another_task_is_refused():
 @every_task
 def test_an_episode_is_50_steps_at_a_cost_of_1_outside_of_5_cm(task: str):
     [episode] = RolloutJob(config(task)).run(stream_seeds("training", 1))
-    solved, rewards = episode.columns["next.success"].ravel(), episode.columns["next.reward"].ravel()
+    solved, rewards = (
+        episode.columns["next.success"].ravel(),
+        episode.columns["next.reward"].ravel(),
+    )
     assert len(episode) == FetchEnv.horizon
     assert np.array_equal(rewards, np.where(solved, 0.0, -1.0))
     assert episode.success_at_end
@@ -99,7 +104,9 @@ def test_the_expert_is_a_function_of_the_state(task: str):
 @every_task
 def test_positions_are_those_of_the_observation(task: str):
     env = FetchEnv(task)
-    row = dict(zip(env.spec.environment_state_names, env.observe().environment_state.tolist(), strict=True))
+    row = dict(
+        zip(env.spec.environment_state_names, env.observe().environment_state.tolist(), strict=True)
+    )
     found = positions(config(task), env.get_state().to_vector())
     names = {"hand": "ee"} | ({"object": "object"} if FETCH_TASKS[task].has_object else {})
     assert found.keys() == names.keys()

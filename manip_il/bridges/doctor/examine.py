@@ -56,16 +56,24 @@ def has_errors(findings: Sequence[Finding]) -> bool:
 
 
 def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
-    """Repair what can be repaired; yield one line for each repair, or for the reason why one was not possible.
+    """Repair what can be repaired.
 
-    Nothing is deleted: replaced and moved files are kept in `ROOT.before-repair`. Raises `ManipError` if that exists,
-    if a link leads outside, and while another process uses the dataset. Check the dataset again afterwards.
+    Yield one line for each repair, or for the reason why one was not possible.
+
+    Nothing is deleted: replaced and moved files are kept in `ROOT.before-repair`. Raises
+    `ManipError` if that exists, if a link leads outside, and while another process uses the
+    dataset. Check the dataset again afterwards.
     """
     kept = root.with_name(f"{root.name}.before-repair")
     if kept.exists():
         raise ManipError(f"{kept} already exists, from an earlier repair; move it elsewhere first")
-    if linked := [path for path in root.rglob("*") if not path.resolve().is_relative_to(root.resolve())]:
-        raise ManipError(f"{linked[0]} is a link out of the dataset, which is not followed; repair a copy instead")
+    if linked := [
+        path for path in root.rglob("*") if not path.resolve().is_relative_to(root.resolve())
+    ]:
+        raise ManipError(
+            f"{linked[0]} is a link out of the dataset, which is not followed; repair a copy"
+            " instead"
+        )
     with exclusive(root):
         if has_errors(findings) and journals_of(root).is_dir():
             yield _rebuild(root, kept)
@@ -86,7 +94,9 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
 
 
 def _rebuild(root: Path, kept: Path) -> str:
-    """Build the dataset from its journals, unless they hold fewer episodes than it does, or another recording."""
+    """Build the dataset from its journals, unless they hold fewer episodes than it does, or
+    another recording.
+    """
     journals, fresh = journals_of(root), root.with_name(f".{root.name}.rebuilt.partial")
     try:
         info, _ = build(journals, fresh, replace=True)
@@ -94,7 +104,10 @@ def _rebuild(root: Path, kept: Path) -> str:
         return f"not rebuilt: {problem}"
     reason = ""
     with suppress(ManipError, LookupError):  # if the dataset cannot be read
-        was, now = ((data.spec.robot, data.provenance["seeds"][0]) for data in map(Dataset.open, (root, fresh)))
+        was, now = (
+            (data.spec.robot, data.provenance["seeds"][0])
+            for data in map(Dataset.open, (root, fresh))
+        )
         if was != now:
             reason = "holds another recording; move it elsewhere"
     with suppress(ManipError):
@@ -120,14 +133,19 @@ def _recount(root: Path) -> dict[str, Any]:
 
 
 def _recompute(root: Path) -> dict[str, Any]:
-    """Return statistics of finite columns and, from some pictures, of cameras; {} if the stored ones are right."""
+    """Return statistics of finite columns and, from some pictures, of cameras.
+
+    {} if the stored ones are right.
+    """
     if not any(STATS in str(finding) for finding in examine_folder(root)):
         return {}
     dataset, stats = Dataset.open(root), Statistics()
     rows = np.unique(np.linspace(0, len(dataset) - 1, _PICTURES).astype(np.int64))
     for key, feature in dataset.features.items():
         if feature.is_rgb:
-            stats[key] = picture_statistics(dataset.frames(key, rows)) | {"count": np.array([len(dataset)])}
+            stats[key] = picture_statistics(dataset.frames(key, rows)) | {
+                "count": np.array([len(dataset)])
+            }
         elif feature.dtype in NUMBERS:
             values = dataset.columns([key])[key].reshape(-1, feature.shape[-1])
             if np.isfinite(values).all():

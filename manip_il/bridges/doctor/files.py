@@ -1,4 +1,6 @@
-"""What a finding is, and checks that files agree: `info.json`, episodes, tasks, statistics, rows, videos."""
+"""What a finding is, and checks that files agree: `info.json`, episodes, tasks, statistics,
+rows, videos.
+"""
 
 import re
 from collections.abc import Collection, Iterator
@@ -29,14 +31,18 @@ _TOLERANCES = {"min": 1e-5, "max": 1e-5, "mean": 1e-4, "std": 2e-3}  # shares of
 _OF_SPREAD = 0.05
 # a spread of less than this share of the largest value is lost in float32, so it is not compared
 _NOISE = 1e-5
-_TEMPORARY = re.compile(r"\..*\.tmp|.*\.(partial|incomplete|ffconcat)|tmp[a-z0-9_]{8}|images|\.cache")
+_TEMPORARY = re.compile(
+    r"\..*\.tmp|.*\.(partial|incomplete|ffconcat)|tmp[a-z0-9_]{8}|images|\.cache"
+)
 # largest difference in time between a video frame and its row that LeRobot's reader accepts [s]
 _LATE = 1e-4
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of a report. Errors are wrong data, or data on which LeRobot cannot train; others are warnings.
+    """One line of a report.
+
+    Errors are wrong data, or data on which LeRobot cannot train; others are warnings.
 
     Args:
         place: A file in the dataset or next to it, a column, or the dataset.
@@ -63,7 +69,9 @@ def journals_of(root: Path) -> Path:
     return root.absolute().with_name(f"{root.absolute().name}.journals")
 
 
-def of_episodes(root: Path, place: str, text: str, episodes: Collection[int], *, is_error: bool = False) -> Finding:
+def of_episodes(
+    root: Path, place: str, text: str, episodes: Collection[int], *, is_error: bool = False
+) -> Finding:
     """Return a finding about episodes that cannot be repaired.
 
     Args:
@@ -96,8 +104,12 @@ def check_leftovers(dataset: Dataset) -> Iterator[Finding]:
 
 def leftovers(root: Path) -> list[Path]:
     """Return unneeded temporary files and folders in a dataset."""
-    named = [path for path in [*root.iterdir(), *root.glob("meta/*")] if _TEMPORARY.fullmatch(path.name)]
-    return sorted(path for path in named if any(file.is_file() for file in [path, *path.rglob("*")]))
+    named = [
+        path for path in [*root.iterdir(), *root.glob("meta/*")] if _TEMPORARY.fullmatch(path.name)
+    ]
+    return sorted(
+        path for path in named if any(file.is_file() for file in [path, *path.rglob("*")])
+    )
 
 
 def check_info(dataset: Dataset) -> Iterator[Finding]:
@@ -130,14 +142,22 @@ def check_rows(dataset: Dataset) -> Iterator[Finding]:
     timestamp = f"data: timestamp at {dataset.fps:.6g} frames per second"
     for place, found, wanted in (
         (f"{layout.INFO}: total_episodes", [info.episodes], [len(table)]),
-        (f"{layout.INFO}: total_tasks", [len(tasks) if info.tasks is None else info.tasks], [len(tasks)]),
+        (
+            f"{layout.INFO}: total_tasks",
+            [len(tasks) if info.tasks is None else info.tasks],
+            [len(tasks)],
+        ),
         ("meta/episodes: episode_index", table.index, np.arange(len(table))),
         ("meta/episodes: dataset_from_index", table.start, ends - table.length),
         ("meta/episodes: dataset_to_index", table.stop, ends),
         ("meta/tasks.parquet: task_index", sorted(tasks), np.arange(len(tasks))),
         ("data: task_index", task, task.clip(0, len(tasks) - 1)),
         ("data: index", columns[layout.INDEX], np.arange(len(frame))),
-        ("data: episode_index", columns[layout.EPISODE_INDEX], np.repeat(table.index, table.length)),
+        (
+            "data: episode_index",
+            columns[layout.EPISODE_INDEX],
+            np.repeat(table.index, table.length),
+        ),
         ("data: frame_index", columns[layout.FRAME_INDEX], frame),
         (timestamp, columns[layout.TIMESTAMP], frame / dataset.fps),
     ):
@@ -145,7 +165,9 @@ def check_rows(dataset: Dataset) -> Iterator[Finding]:
             yield Finding(place, text)
     if unknown := {text for texts in table.tasks for text in texts} - {*tasks.values()}:
         names = list_first([*map(repr, unknown)])
-        yield Finding("meta/episodes: tasks", f"names the task {names}, which {layout.TASKS} does not hold")
+        yield Finding(
+            "meta/episodes: tasks", f"names the task {names}, which {layout.TASKS} does not hold"
+        )
 
 
 def _differ(found: Any, wanted: Any, tolerance: Any) -> str:
@@ -173,7 +195,9 @@ def check_numbers(dataset: Dataset) -> Iterator[Finding]:
         table = dataset.statistics.get(key) if has_statistics else None
         text = "" if table else "is missing"
         if feature.dtype in NUMBERS:
-            values = dataset.columns([key])[key].reshape(len(dataset), -1).astype(np.float64, copy=False)
+            values = (
+                dataset.columns([key])[key].reshape(len(dataset), -1).astype(np.float64, copy=False)
+            )
             bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
             if len(bad):
                 what = f"not finite in row {bad[0]:,} ({len(bad):,} such rows)"
@@ -186,8 +210,12 @@ def check_numbers(dataset: Dataset) -> Iterator[Finding]:
 
 
 def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Feature) -> str:
-    """Return how stored statistics differ from those of `values` (N, n), or along a matrix's last axis; "" if equal."""
-    flat = values if stored["mean"].size == values.shape[1] else values.reshape(-1, feature.shape[-1])
+    """Return how stored statistics differ from those of `values` (N, n), or along a matrix's
+    last axis; "" if equal.
+    """
+    flat = (
+        values if stored["mean"].size == values.shape[1] else values.reshape(-1, feature.shape[-1])
+    )
     largest = np.abs(flat).max(axis=0)
     spread = flat.std(axis=0)
     most = np.where(spread > _NOISE * largest, _OF_SPREAD * spread, np.inf)
@@ -200,7 +228,9 @@ def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Fea
 
 
 def check_frames(dataset: Dataset) -> Iterator[Finding]:
-    """Check that every row has a picture in its data file, or a video frame at its time, without decoding."""
+    """Check that every row has a picture in its data file, or a video frame at its time, without
+    decoding.
+    """
     table, root = dataset.episodes, dataset.root
     for feature in dataset.info.of_dtype("image"):
         for path in dataset.data_files:
@@ -219,7 +249,9 @@ def check_frames(dataset: Dataset) -> Iterator[Finding]:
             wanted = np.concatenate(
                 [
                     start + np.arange(length) / dataset.fps
-                    for file, start, length in zip(clips.files, clips.starts, table.length, strict=True)
+                    for file, start, length in zip(
+                        clips.files, clips.starts, table.length, strict=True
+                    )
                     if file == name
                 ]
             )

@@ -1,6 +1,7 @@
 """Why a policy may not learn from a dataset: warnings about its motions and cameras, with numbers.
 
-Motions are checked in episodes driven by a teacher; if a learner drives, actions are labels that were not executed.
+Motions are checked in episodes driven by a teacher; if a learner drives, actions are labels that
+were not executed.
 """
 
 import re
@@ -47,7 +48,9 @@ def check_motions(dataset: Dataset) -> Iterator[Finding]:
         learner = dataset.columns([s.ACTOR])[s.ACTOR].reshape(-1) == Actor.LEARNER
     table = dataset.episodes
     spans = zip(table.index.tolist(), map(slice, table.start, table.stop), strict=True)
-    rows = {episode: span for episode, span in spans if len(both[span]) > 1 and not learner[span].any()}
+    rows = {
+        episode: span for episode, span in spans if len(both[span]) > 1 and not learner[span].any()
+    }
     if not rows or not np.isfinite(both).all():
         return  # reported by another check
     yield from _check_idle(dataset, rows, both)
@@ -74,31 +77,44 @@ def _check_idle(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
         idle[episode] = max(np.flatnonzero(moving), default=-1) + 1 - sum(moving)
     share = sum(idle.values()) * second / len(both)
     if share > _IDLE:
-        text = f"nothing moves for seconds, in {share:.0%} of the frames: a policy learns to stand still"
+        text = (
+            f"nothing moves for seconds, in {share:.0%} of the frames: a policy learns to stand"
+            " still"
+        )
         yield of_episodes(dataset.root, s.ACTION, text, [*filter(idle.get, idle)])
 
 
 def _check_wraps(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
-    """Find joints whose angle jumps between two frames from one end of a turn, such as 180 degrees, to the other."""
+    """Find joints whose angle jumps between two frames from one end of a turn, such as 180
+    degrees, to the other.
+    """
     labels = np.array([*dataset.features[s.STATE].labels, *dataset.features[s.ACTION].labels])
     for half in _HALF_TURNS:
-        wraps = (np.abs(np.diff(both, axis=0)) > 1.8 * half) & (np.abs(both).max(axis=0) < 1.01 * half)
-        where, joints = np.nonzero([wraps[span.start : span.stop - 1].any(axis=0) for span in rows.values()])
+        wraps = (np.abs(np.diff(both, axis=0)) > 1.8 * half) & (
+            np.abs(both).max(axis=0) < 1.01 * half
+        )
+        where, joints = np.nonzero(
+            [wraps[span.start : span.stop - 1].any(axis=0) for span in rows.values()]
+        )
         if len(where):
             names = list_first(np.unique(labels[joints]))
             episodes = list_first(np.array([*rows])[np.unique(where)])
             text = (
-                f"{names} jump by a turn at +-{half:.4g} (episodes {episodes}): relative actions are a turn too long "
-                "there, and a policy's mean of both ends points away"
+                f"{names} jump by a turn at +-{half:.4g} (episodes {episodes}): relative actions"
+                " are a turn too long there, and a policy's mean of both ends points away"
             )
             yield warning(s.STATE, text, f"unwrap the angles, or move the joint's zero: {_AGAIN}")
 
 
 def _check_lag(dataset: Dataset, rows: Rows, told: F64, found: F64) -> Iterator[Finding]:
-    """Find actions that lag the motion that they should cause, or lead it by too much, by cross-correlation."""
+    """Find actions that lag the motion that they should cause, or lead it by too much, by
+    cross-correlation.
+    """
     lengths = [span.stop - span.start for span in rows.values()]
     longest = min(round(dataset.fps / 2) + 1, int(np.median(lengths)) // 4)
-    inner = np.concatenate([np.arange(span.start + longest, span.stop - longest) for span in rows.values()])
+    inner = np.concatenate(
+        [np.arange(span.start + longest, span.stop - longest) for span in rows.values()]
+    )
     leads = range(-longest, longest + 1)
     curves = np.array([_correlate(told[inner - lead], found[inner]) for lead in leads])
     followed = curves.max(axis=0) > 0.9  # other actions are not position targets
@@ -122,8 +138,12 @@ def _correlate(left: F64, right: F64) -> F64:
     return (left * right).sum(axis=0) / np.maximum(scale, 1e-9)
 
 
-def _check_joints(dataset: Dataset, rows: Rows, told: F64, found: F64, names: NDArray[np.str_]) -> Iterator[Finding]:
-    """Find joints whose zero or sign differs between episodes, by their start and their correlation with actions."""
+def _check_joints(
+    dataset: Dataset, rows: Rows, told: F64, found: F64, names: NDArray[np.str_]
+) -> Iterator[Finding]:
+    """Find joints whose zero or sign differs between episodes, by their start and their
+    correlation with actions.
+    """
     if len(rows) < _LEAST:
         return
     starts = np.array([found[span.start] for span in rows.values()])
@@ -143,7 +163,9 @@ def _check_joints(dataset: Dataset, rows: Rows, told: F64, found: F64, names: ND
 
 
 def _find_apart(values: F64, least: float) -> Mask:
-    """Return which values (E,) are outliers: beyond a gap wider than `least` and 5 times the range of either side."""
+    """Return which values (E,) are outliers: beyond a gap wider than `least` and 5 times the
+    range of either side.
+    """
     ranked = np.sort(values)
     cut = int(np.argmax(np.diff(ranked))) + 1
     above = values >= ranked[cut]
@@ -155,14 +177,17 @@ def _find_apart(values: F64, least: float) -> Mask:
 def _check_commands(told: F64, found: F64, names: NDArray[np.str_]) -> Iterator[Finding]:
     """Find commands that are never reached, mostly of the gripper.
 
-    A joint that moves by a small share of its command but correlates with it has other units: no finding.
+    A joint that moves by a small share of its command but correlates with it has other units: no
+    finding.
     """
     low, high = np.quantile(told, [0.01, 0.99], axis=0)
     below, above = np.quantile(found, [0.01, 0.99], axis=0)
     extent = high - low
     share = (above - below) / np.maximum(extent, 1e-9)
     stuck = (share < 0.05) & (np.abs(_correlate(told, found)) < 0.5)
-    inside = (share >= 0.05) & (share < 0.5) & (np.minimum(below - low, high - above) > 0.1 * extent)
+    inside = (
+        (share >= 0.05) & (share < 0.5) & (np.minimum(below - low, high - above) > 0.1 * extent)
+    )
     for joint in np.flatnonzero((extent > 1e-6) & (stuck | inside)):
         commanded = f"{names[joint]} is commanded {low[joint]:.3g} to {high[joint]:.3g}"
         text = f"{commanded}, but only moves from {below[joint]:.3g} to {above[joint]:.3g}"
@@ -170,11 +195,16 @@ def _check_commands(told: F64, found: F64, names: NDArray[np.str_]) -> Iterator[
 
 
 def check_cameras(dataset: Dataset) -> Iterator[Finding]:
-    """Find black or frozen pictures and swapped cameras, from some pictures of up to 100 episodes."""
-    table, _ = dataset.episodes, dataset.data_files  # first, so that a broken file raises as in other checks
+    """Find black or frozen pictures and swapped cameras, from some pictures of up to 100
+    episodes.
+    """
+    # first, so that a broken file raises as in other checks
+    table, _ = dataset.episodes, dataset.data_files
     chosen = np.flatnonzero(table.length > 1)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(_EPISODES, len(chosen))).astype(int)]
-    rows = np.linspace(table.start[chosen], table.stop[chosen] - 1, _PICTURES, dtype=np.int64, axis=-1)
+    rows = np.linspace(
+        table.start[chosen], table.stop[chosen] - 1, _PICTURES, dtype=np.int64, axis=-1
+    )
     cameras = [key for key in dataset.cameras if dataset.features[key].is_rgb and len(rows)]
     seen = {key: _thumbnails(dataset, key, rows) for key in cameras}
     state = np.zeros((len(dataset), 1))
@@ -187,7 +217,11 @@ def check_cameras(dataset: Dataset) -> Iterator[Finding]:
         still = np.abs(np.diff(pictures, axis=1)).max(axis=2) < _SAME
         frozen = (still & moved).sum(axis=1) > np.maximum(1, moved.sum(axis=1) / 2)
         odd = {"is black": dark, "is frozen while the joints move": frozen & ~dark}
-        odd |= {f"is swapped with {other}": _find_swapped(pictures, seen[other]) for other in seen if other > key}
+        odd |= {
+            f"is swapped with {other}": _find_swapped(pictures, seen[other])
+            for other in seen
+            if other > key
+        }
         for what, which in odd.items():
             if which.any():
                 text = f"{what} in {which.sum()} of {len(which)} episodes"
@@ -198,17 +232,24 @@ def _thumbnails(dataset: Dataset, camera: str, rows: NDArray[np.int64]) -> F64:
     """Return small pictures, (E, P, values), of these rows, (E, P)."""
     reader = dataset.camera(camera)
     small = [
-        [Image.fromarray(picture).resize(_SIZE, Image.Resampling.BOX) for picture in reader.rows(episode)]
+        [
+            Image.fromarray(picture).resize(_SIZE, Image.Resampling.BOX)
+            for picture in reader.rows(episode)
+        ]
         for episode in rows
     ]
     return np.array(small, np.float64).reshape(*rows.shape, -1)
 
 
 def _find_swapped(left: F64, right: F64) -> Mask:
-    """Return the episodes, (E,), in which each of two cameras shows what the other one shows in most episodes."""
+    """Return the episodes, (E,), in which each of two cameras shows what the other one shows in
+    most episodes.
+    """
     pictures = np.stack([left.mean(axis=1), right.mean(axis=1)])
     typical = np.median(pictures, axis=1, keepdims=True)
-    straight, crossed = (np.abs(pictures - usual).mean(axis=2).sum(axis=0) for usual in (typical, typical[::-1]))
+    straight, crossed = (
+        np.abs(pictures - usual).mean(axis=2).sum(axis=0) for usual in (typical, typical[::-1])
+    )
     return (crossed < 0.5 * straight) & (straight > _DARK)
 
 

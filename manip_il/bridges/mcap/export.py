@@ -1,7 +1,8 @@
 """Export any LeRobot v3.0 dataset as MCAP: one file per episode, one topic per column, bit for bit.
 
-States and actions become `foxglove.JointStates`, other numbers LeRobot's scalars, decoded pictures `foxglove.RawImage`,
-text `foxglove.Log`. With `mapping.yaml`, next to the files, an import recreates the dataset.
+States and actions become `foxglove.JointStates`, other numbers LeRobot's scalars, decoded pictures
+`foxglove.RawImage`, text `foxglove.Log`. With `mapping.yaml`, next to the files, an import
+recreates the dataset.
 """
 
 from collections.abc import Iterator
@@ -33,7 +34,9 @@ _BATCH = 64  # decoded pictures in memory at a time
 
 
 def left_out(info: Info) -> list[str]:
-    """Return the columns that are not exported: language, depth and other pictures that are not RGB."""
+    """Return the columns that are not exported: language, depth and other pictures that are not
+    RGB.
+    """
     exported = {*INDEX_FEATURES, *(column.key for column in _columns(info))}
     return [key for key in info.features if key not in exported]
 
@@ -41,23 +44,29 @@ def left_out(info: Info) -> list[str]:
 def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
     """Write every episode to `folder/episode_<index>.mcap`, yield its path, then write the mapping.
 
-    The same dataset gives the same bytes. Raises `NotFiniteError` for NaN and infinity, which JSON lacks, and what
-    `Dataset.columns` and `Dataset.camera` raise.
+    The same dataset gives the same bytes. Raises `NotFiniteError` for NaN and infinity, which JSON
+    lacks, and what `Dataset.columns` and `Dataset.camera` raise.
     """
     columns = _columns(dataset.info)
-    cameras = {column.key: dataset.camera(column.key) for column in columns if column.dtype in PICTURES}
+    cameras = {
+        column.key: dataset.camera(column.key) for column in columns if column.dtype in PICTURES
+    }
     numbers = [column.key for column in columns if column.key not in cameras]
     table = dataset.columns([*numbers, layout.TASK_INDEX])
     for key in numbers:
         require_finite(f"{dataset.root}, column {key!r}", table[key])
     texts = dataset.texts(table[layout.TASK_INDEX])
     episodes, rate = dataset.episodes, s.exact_rate(dataset.fps)
-    for episode, start, stop in zip(episodes.index.tolist(), episodes.start, episodes.stop, strict=True):
+    for episode, start, stop in zip(
+        episodes.index.tolist(), episodes.start, episodes.stop, strict=True
+    ):
         times = foxglove.frame_times(stop - start, rate)
         channels = {_TASK_TOPIC: foxglove.texts(TASK, texts[start:stop], times)}
         for column in columns:
             key = column.key
-            values = _pictures(cameras[key], start, stop) if key in cameras else table[key][start:stop]
+            values = (
+                _pictures(cameras[key], start, stop) if key in cameras else table[key][start:stop]
+            )
             channels[_topic(key)] = _messages(column, values, times)
         path = folder / f"episode_{episode:06d}.mcap"
         with path.open("wb") as stream:
@@ -66,7 +75,9 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
             foxglove.add_channels(writer, channels, times)
             writer.finish()
         yield path
-    mapping = yaml.safe_dump(_mapping_of(dataset.info), sort_keys=False, allow_unicode=True, default_flow_style=None)
+    mapping = yaml.safe_dump(
+        _mapping_of(dataset.info), sort_keys=False, allow_unicode=True, default_flow_style=None
+    )
     (folder / MAPPING).write_text(_HEADER + mapping, encoding="utf-8")
 
 
@@ -79,7 +90,12 @@ def _mapping_of(info: Info) -> dict[str, Any]:
         if column.dtype not in PICTURES:
             numbers = "joints[:].position" if _is_joints(column) else "scalars[:].value"
             path = "message" if column.dtype == TEXT else numbers
-            about = {"field": path, "dtype": column.dtype, "names": column.names, "shape": list(column.shape)}
+            about = {
+                "field": path,
+                "dtype": column.dtype,
+                "names": column.names,
+                "shape": list(column.shape),
+            }
         features[column.key] = {"topic": _topic(column.key), **about, **near}
     task = {"topic": _TASK_TOPIC, "field": "message", **near}
     return {"fps": info.fps, "robot_type": info.robot or None, "task": task, "features": features}
@@ -88,7 +104,9 @@ def _mapping_of(info: Info) -> dict[str, Any]:
 def _columns(info: Info) -> list[Feature]:
     """Return the columns that are exported."""
     kinds = (*NUMBERS, TEXT)
-    columns = [column for column in info.features.values() if column.dtype in kinds or column.is_rgb]
+    columns = [
+        column for column in info.features.values() if column.dtype in kinds or column.is_rgb
+    ]
     return [column for column in columns if column.key not in INDEX_FEATURES]
 
 
@@ -100,7 +118,11 @@ def _messages(column: Feature, values: Any, times: foxglove.Times) -> foxglove.M
     values = values.reshape(len(times), -1)
     if _is_joints(column):
         return foxglove.joint_states(column.labels, values, times)
-    unnamed = [column.key] if column.size == 1 else [f"{column.key}_{place}" for place in range(column.size)]
+    unnamed = (
+        [column.key]
+        if column.size == 1
+        else [f"{column.key}_{place}" for place in range(column.size)]
+    )
     labels = column.labels if column.names else unnamed  # as in LeRobot
     return foxglove.scalars(labels, values.tolist())
 
@@ -115,5 +137,7 @@ def _is_joints(column: Feature) -> bool:
 
 
 def _topic(key: str) -> str:
-    """Return a column's topic, with slashes instead of dots, because Foxglove splits paths at dots."""
+    """Return a column's topic, with slashes instead of dots, because Foxglove splits paths at
+    dots.
+    """
     return "/" + key.replace(".", "/")

@@ -1,7 +1,8 @@
-"""Import MCAP files as a LeRobot dataset: one episode per file, resampled to the dataset's rate, without gaps.
+"""Import MCAP files as a LeRobot dataset: one episode per file, resampled to the dataset's rate,
+without gaps.
 
-An episode lasts from the time when all topics have started to the time when the first one ends, by log time. Messages
-are read by the library's reader and decoders.
+An episode lasts from the time when all topics have started to the time when the first one ends, by
+log time. Messages are read by the library's reader and decoders.
 """
 
 import importlib
@@ -44,7 +45,10 @@ _CHANNELS = {"rgb8": slice(None), "bgr8": slice(None, None, -1)}
 
 
 def list_files(source: Path) -> list[Path]:
-    """Return the MCAP file, or all those in a folder, sorted by name. Raises `ManipError` if there are none."""
+    """Return the MCAP file, or all those in a folder, sorted by name.
+
+    Raises `ManipError` if there are none.
+    """
     paths = sorted(path for path in source.glob("*.mcap") if not path.name.startswith("."))
     if not paths and not source.is_file():
         raise ManipError(f"{source} is not a file, and holds no *.mcap files")
@@ -81,7 +85,9 @@ def import_files(
         for path in paths:
             frames = list(read_frames(path, mapping))
             columns = {
-                key: np.array([frame[key] for frame in frames], object if feature["dtype"] == TEXT else None)
+                key: np.array(
+                    [frame[key] for frame in frames], object if feature["dtype"] == TEXT else None
+                )
                 for key, feature in features.items()
             }
             on_episode()
@@ -99,7 +105,9 @@ def _read_all(paths: list[Path], mapping: Mapping) -> None:
             for key, value in frame.items():
                 shape = np.shape(value)
                 if shape != wanted.setdefault(key, shape):
-                    raise MismatchError(f"the shape of {key!r}", str(path), shape, str(paths[0]), wanted[key])
+                    raise MismatchError(
+                        f"the shape of {key!r}", str(path), shape, str(paths[0]), wanted[key]
+                    )
 
 
 def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
@@ -115,17 +123,25 @@ def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
     for topic, stamp, content in read_messages(path, columns):
         for key in columns[topic]:  # if stamps are equal, the last message counts
             where = f"{path}, topic {topic}, {key} at {stamp} ns"
-            found[key][stamp] = None if sources[key].is_camera else _value(where, sources[key], content)
+            found[key][stamp] = (
+                None if sources[key].is_camera else _value(where, sources[key], content)
+            )
     stamps = {topic: np.array([*found[keys[0]]], np.int64) for topic, keys in columns.items()}
     if missing := [topic for topic, times in stamps.items() if not len(times)]:
-        raise ManipError(f"{path} has no messages of {missing[0]}; expected all topics of the mapping")
+        raise ManipError(
+            f"{path} has no messages of {missing[0]}; expected all topics of the mapping"
+        )
     times = _times(path, stamps, exact_rate(mapping.fps))
     rows: dict[str, Any] = {TASK: [mapping.task] * len(times)}
     for key, source in sources.items():
         where = f"{path}, topic {source.topic}, {key}"
         own = stamps[source.topic]
         chosen = own[pick(where, source, own, times)].tolist()
-        rows[key] = read_pictures(path, source.topic, chosen) if source.is_camera else map(found[key].get, chosen)
+        rows[key] = (
+            read_pictures(path, source.topic, chosen)
+            if source.is_camera
+            else map(found[key].get, chosen)
+        )
     for values in zip(*rows.values(), strict=True):
         yield dict(zip(rows, values, strict=True))
 
@@ -151,7 +167,8 @@ def pick(where: str, source: TopicSource, stamps: I64, times: I64) -> I64:
         times: The frames' times [ns], (T,), ascending, none before the first message.
 
     Raises:
-        ManipError: A frame's message is farther away in time than the tolerance; names both and the time of the gap.
+        ManipError: A frame's message is farther away in time than the tolerance; names both and the
+            time of the gap.
     """
     chosen = np.searchsorted(stamps, times, side="right") - 1
     if source.resample == "nearest":
@@ -160,14 +177,24 @@ def pick(where: str, source: TopicSource, stamps: I64, times: I64) -> I64:
     far = np.abs(times - stamps[chosen]) > source.tolerance * NANOSECONDS
     if far.any():
         frame = int(np.argmax(far))
-        place = f"{(times[frame] - times[0]) / NANOSECONDS:g} s (stamp {times[frame]} ns, frame {frame})"
-        remedy = "between frame and message: raise the tolerance in the mapping, or leave out this file"
-        raise ManipError(f"{where}: a gap at {place}; {source.resample} allows {source.tolerance:g} s {remedy}")
+        place = (
+            f"{(times[frame] - times[0]) / NANOSECONDS:g} s (stamp {times[frame]} ns, frame"
+            f" {frame})"
+        )
+        remedy = (
+            "between frame and message: raise the tolerance in the mapping, or leave out this file"
+        )
+        raise ManipError(
+            f"{where}: a gap at {place}; {source.resample} allows {source.tolerance:g} s {remedy}"
+        )
     return chosen
 
 
 def _value(where: str, source: TopicSource, content: Any) -> Any:
-    """Return a column's text or array (*shape) from a message. Raises `ManipError` for values that do not fit."""
+    """Return a column's text or array (*shape) from a message.
+
+    Raises `ManipError` for values that do not fit.
+    """
     try:
         values = [value for path in source.paths for value in values_at(path, content)]
         if source.width not in (None, len(values)):
@@ -178,15 +205,22 @@ def _value(where: str, source: TopicSource, content: Any) -> Any:
             exact = np.array(values, object)
             with np.errstate(over="ignore"):  # the next line checks for infinity
                 numbers = exact.astype(source.dtype)
-            if np.isfinite(numbers).all() if numbers.dtype.kind == "f" else (numbers == exact).all():
+            if (
+                np.isfinite(numbers).all()
+                if numbers.dtype.kind == "f"
+                else (numbers == exact).all()
+            ):
                 return numbers.reshape(source.shape or -1)
-        raise ValueError(f"the message has {checks.shorten(values)}; expected finite {source.dtype} numbers")
+        raise ValueError(
+            f"the message has {checks.shorten(values)}; expected finite {source.dtype} numbers"
+        )
     except (ManipError, OverflowError, ValueError) as error:
         raise ManipError(f"{where}: {error}") from error
 
 
 def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-    """Yield topic, log time [ns] and decoded content of the messages of some topics, in order of time.
+    """Yield topic, log time [ns] and decoded content of the messages of some topics, in order of
+    time.
 
     Raises `ManipError` naming the file for any error of the MCAP library or a decoder.
     """
@@ -197,22 +231,30 @@ def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, in
         with checks.open_outside(path, "an MCAP file") as stream:
             reader = make_reader(stream, validate_crcs=True, decoder_factories=factories)
             for _, channel, message, content in reader.iter_decoded_messages(topics):
-                stamp = checks.whole(f"the log time of {channel.topic}", message.log_time, 0, _LAST_STAMP)
+                stamp = checks.whole(
+                    f"the log time of {channel.topic}", message.log_time, 0, _LAST_STAMP
+                )
                 yield channel.topic, stamp, content
     except MemoryError:
         raise
     except Exception as error:  # a damaged file can make a parser raise anything
-        raise ManipError(f"cannot read {path}: {checks.one_line(error) or type(error).__name__}") from error
+        raise ManipError(
+            f"cannot read {path}: {checks.one_line(error) or type(error).__name__}"
+        ) from error
 
 
 class _JsonFactory(DecoderFactory):
-    """Last decoder factory to be asked: decodes JSON and raises `ValueError` for any other encoding."""
+    """Last decoder factory to be asked: decodes JSON and raises `ValueError` for any other
+    encoding.
+    """
 
     @override
     def decoder_for(self, message_encoding: str, schema: Schema | None) -> Callable[[bytes], Any]:
         if message_encoding == MessageEncoding.JSON:
             return json.loads
-        expected = "protobuf, json or, after `pip install mcap-ros2-support`, cdr with ros2msg schemas"
+        expected = (
+            "protobuf, json or, after `pip install mcap-ros2-support`, cdr with ros2msg schemas"
+        )
         raise ValueError(f"messages are {message_encoding}; expected {expected}")
 
 
@@ -228,7 +270,9 @@ def read_pictures(path: Path, topic: str, stamps: Sequence[int]) -> Iterator[U8]
         ManipError: A message holds no picture; names file, topic and stamp.
     """
     frames = Counter(stamps)
-    for stamp, messages in itertools.groupby(read_messages(path, [topic]), lambda message: message[1]):
+    for stamp, messages in itertools.groupby(
+        read_messages(path, [topic]), lambda message: message[1]
+    ):
         *_, (_, _, content) = messages  # if stamps are equal, the last message counts
         if stamp in frames:
             try:
@@ -239,12 +283,21 @@ def read_pictures(path: Path, topic: str, stamps: Sequence[int]) -> Iterator[U8]
 
 
 def _picture(message: Any) -> U8:
-    """Return the picture (height, width, 3) of a Foxglove or ROS message. Raises `ValueError` if there is none."""
+    """Return the picture (height, width, 3) of a Foxglove or ROS message.
+
+    Raises `ValueError` if there is none.
+    """
     if hasattr(message, "format"):  # CompressedImage
         return decode_picture(bytes(message.data))
     encoding = getattr(message, "encoding", "none")  # RawImage of Foxglove, Image of ROS
     if encoding not in _CHANNELS:
-        raise ValueError(f"the picture is encoded as {encoding!r}; expected {' or '.join(_CHANNELS)}, PNG or JPEG")
+        raise ValueError(
+            f"the picture is encoded as {encoding!r}; expected {' or '.join(_CHANNELS)}, PNG or"
+            " JPEG"
+        )
     height, width = message.height, message.width
-    rows = np.frombuffer(message.data, np.uint8).reshape(height, message.step or width * 3)  # rows may be padded
-    return np.ascontiguousarray(rows[:, : width * 3].reshape(height, width, 3)[:, :, _CHANNELS[encoding]])
+    # rows may be padded
+    rows = np.frombuffer(message.data, np.uint8).reshape(height, message.step or width * 3)
+    return np.ascontiguousarray(
+        rows[:, : width * 3].reshape(height, width, 3)[:, :, _CHANNELS[encoding]]
+    )

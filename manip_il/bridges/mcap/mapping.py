@@ -1,8 +1,11 @@
-"""Mapping files of an import: the topics and fields of every column. `configs/mcap/panda.yaml` explains one.
+"""Mapping files of an import: the topics and fields of every column.
 
-A field is a path in a message: `pose.position.x`, `data[0]`, `scalars[:].value`, `joints[name=elbow].position`. `[:]`
-selects every element of a list, `[name=elbow]` the one whose name is elbow. A name may have any characters except dots
-and square brackets, the text after `=` any except a closing bracket.
+`configs/mcap/panda.yaml` explains one.
+
+A field is a path in a message: `pose.position.x`, `data[0]`, `scalars[:].value`,
+`joints[name=elbow].position`. `[:]` selects every element of a list, `[name=elbow]` the one whose
+name is elbow. A name may have any characters except dots and square brackets, the text after `=`
+any except a closing bracket.
 """
 
 import json
@@ -35,8 +38,8 @@ class TopicSource:
 
     Args:
         topic: The topic's name.
-        resample: `nearest` in time (of two equally near, the earlier one), or `previous`, the last one not after the
-            frame.
+        resample: `nearest` in time (of two equally near, the earlier one), or `previous`, the last
+            one not after the frame.
         tolerance: Largest time from frame to message [s].
         field: Paths to a message's numbers or text, joined in order.
         dtype: LeRobot's name for the type of the values.
@@ -62,11 +65,17 @@ class TopicSource:
         if self.is_camera == bool(self.paths):
             raise UsageError(f"{self.topic}: expected either field or video")
         if self.dtype not in (*NUMBERS, TEXT):
-            raise UsageError(f"{self.topic}: dtype is {self.dtype}; expected one of {', '.join((*NUMBERS, TEXT))}")
+            raise UsageError(
+                f"{self.topic}: dtype is {self.dtype}; expected one of"
+                f" {', '.join((*NUMBERS, TEXT))}"
+            )
         checks.number(f"{self.topic}: tolerance", self.tolerance, 0)
         for path in self.paths:
             if not _PATH.fullmatch(path):
-                expected = "names and selectors, as in joints[name=elbow].position, scalars[:].value, data[0]"
+                expected = (
+                    "names and selectors, as in joints[name=elbow].position, scalars[:].value,"
+                    " data[0]"
+                )
                 raise UsageError(f"{self.topic}: the path {path!r} is invalid; expected {expected}")
         # info.json holds them
         checks.text("names", json.dumps(self.names, ensure_ascii=False), checks.LARGEST_YAML)
@@ -138,11 +147,16 @@ def load_mapping(path: Path) -> Mapping:
 def values_at(path: str, message: Any) -> list[Any]:
     """Return the values at a path, in order; if it ends at a list, the list's elements.
 
-    message: a protobuf or ROS 2 message, or parsed JSON. Raises `ManipError` naming the part of `path` that is missing.
+    message: a protobuf or ROS 2 message, or parsed JSON. Raises `ManipError` naming the part of
+    `path` that is missing.
     """
     nodes = [message]
     for selector, name in _STEP.findall(path):
-        nodes = [value for node in nodes for value in (_select(node, selector) if selector else [_field(node, name)])]
+        nodes = [
+            value
+            for node in nodes
+            for value in (_select(node, selector) if selector else [_field(node, name)])
+        ]
     return [value for node in nodes for value in (node if _is_list(node) else [node])]
 
 
@@ -152,19 +166,26 @@ def _select(node: Any, selector: str) -> Sequence[Any]:
     if selector == ":":
         return node
     key, is_named, text = selector.partition("=")
-    found = node[int(key) :][:1] if not is_named else [value for value in node if str(_field(value, key)) == text]
+    found = (
+        node[int(key) :][:1]
+        if not is_named
+        else [value for value in node if str(_field(value, key)) == text]
+    )
     if len(found) != 1:
         raise ManipError(f"[{selector}] matches {len(found)} of {len(node)} elements; expected one")
     return found
 
 
 def _field(node: Any, name: str) -> Any:
-    known: Any = node if isinstance(node, dict) else getattr(node, "__slots__", ())  # ROS messages have slots
+    # ROS messages have slots
+    known: Any = node if isinstance(node, dict) else getattr(node, "__slots__", ())
     if isinstance(node, Message):
         known = node.DESCRIPTOR.fields_by_name
     if name not in known:
         kind = " in a list; select elements by [0], [:] or [name=...]" if _is_list(node) else ""
-        raise ManipError(f"no field {name!r}{kind}{nearest(name, known)}; known: {', '.join(known) or 'none'}")
+        raise ManipError(
+            f"no field {name!r}{kind}{nearest(name, known)}; known: {', '.join(known) or 'none'}"
+        )
     if isinstance(node, Message) and known[name].has_presence and not node.HasField(name):
         raise ManipError(f"{name} is not set in this message")  # protobuf would return zeros
     return node[name] if isinstance(node, dict) else getattr(node, name)

@@ -1,11 +1,15 @@
-"""A repository on the Hugging Face Hub, or the server at HF_ENDPOINT, through huggingface_hub; its card.
+"""A repository on the Hugging Face Hub, or the server at HF_ENDPOINT, through huggingface_hub.
 
-Files keep their paths, so that LeRobot reads them. A push is one commit on top of the version that the folder was
-compared with; then the tag `v3.0`, by which LeRobot finds datasets, is moved to that commit. The Hub provides the size
-and hash of each file of a commit; a manifest lists those that a push wrote, since a repository may hold others.
+Its card.
 
-The card, `README.md`, is made from `card.md.jinja`. It holds no absolute path, token or date, so that the same folder
-gives the same bytes. A card of another program's dataset or policy claims neither our licence nor our authorship.
+Files keep their paths, so that LeRobot reads them. A push is one commit on top of the version that
+the folder was compared with; then the tag `v3.0`, by which LeRobot finds datasets, is moved to that
+commit. The Hub provides the size and hash of each file of a commit; a manifest lists those that a
+push wrote, since a repository may hold others.
+
+The card, `README.md`, is made from `card.md.jinja`. It holds no absolute path, token or date, so
+that the same folder gives the same bytes. A card of another program's dataset or policy claims
+neither our licence nor our authorship.
 """
 
 import re
@@ -21,8 +25,19 @@ from typing import Any
 
 import httpx
 import jinja2
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, RepoFile, constants, set_client_factory
-from huggingface_hub.errors import RemoteEntryNotFoundError, RepositoryNotFoundError, RevisionNotFoundError
+from huggingface_hub import (
+    CommitOperationAdd,
+    CommitOperationDelete,
+    HfApi,
+    RepoFile,
+    constants,
+    set_client_factory,
+)
+from huggingface_hub.errors import (
+    RemoteEntryNotFoundError,
+    RepositoryNotFoundError,
+    RevisionNotFoundError,
+)
 from huggingface_hub.utils import disable_progress_bars
 from huggingface_hub.utils._http import default_client_factory
 
@@ -46,7 +61,9 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.sim.conditions import NOMINAL
 from manip_il.worlds.table import world_of
 
-_ADDRESS = re.compile(r"(datasets/|models/)?((?!datasets/|models/)\w[\w.-]*/\w[\w.-]*)(?:@(\w[\w./-]*))?")
+_ADDRESS = re.compile(
+    r"(datasets/|models/)?((?!datasets/|models/)\w[\w.-]*/\w[\w.-]*)(?:@(\w[\w./-]*))?"
+)
 _HIDDEN = re.compile(r"(.*/)?\.[^./]")  # such as the Hub's own .gitattributes
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _OF_A_DATASET = ("data/", "meta/", "videos/")  # the layout's folders, which are replaced as one
@@ -55,7 +72,9 @@ _ANSWERS = ContextVar[Arrival | None]("_ANSWERS", default=None)  # of the action
 
 
 def _guard_token(request: httpx.Request) -> None:
-    """Remember the token, and remove it if another server is asked, as a page of a listing may name one."""
+    """Remember the token, and remove it if another server is asked, as a page of a listing may
+    name one.
+    """
     SENT.add(request.headers.get("authorization", "").removeprefix("Bearer "))
     if not str(request.url).startswith(f"{constants.ENDPOINT}/"):
         request.headers.pop("authorization", None)
@@ -91,7 +110,10 @@ def _use_client() -> None:
 
 def _client() -> httpx.Client:
     client = default_client_factory()
-    client.event_hooks = {"request": [*client.event_hooks["request"], _guard_token], "response": [_count]}
+    client.event_hooks = {
+        "request": [*client.event_hooks["request"], _guard_token],
+        "response": [_count],
+    }
     return client
 
 
@@ -100,18 +122,33 @@ class Hub:
 
     at_once = 8  # concurrent files
 
-    def __init__(self, address: str, revision: str | None = None, *, private: bool = False, quiet: bool = False):
+    def __init__(
+        self,
+        address: str,
+        revision: str | None = None,
+        *,
+        private: bool = False,
+        quiet: bool = False,
+    ):
         """address: the part after `hf://`. Raises `UsageError` if it is invalid."""
         found = _ADDRESS.fullmatch(address)
         if not found or ".." in address or (revision and found[3] not in (None, revision)):
-            text = "expected hf://datasets/USER/NAME[@REVISION] or hf://USER/NAME[@REVISION], and one revision"
+            text = (
+                "expected hf://datasets/USER/NAME[@REVISION] or hf://USER/NAME[@REVISION], and one"
+                " revision"
+            )
             raise UsageError(f"the hf:// address is invalid; {text}")
         self.kind: Kind = "dataset" if found[1] == "datasets/" else "policy"
         self._place = found[2]
         self._revision = revision or found[3]
         self._private = private
-        self._repo: Any = {"repo_id": self._place, "repo_type": "dataset" if self.kind == "dataset" else "model"}
-        self.name = f"hf://{found[1] or ''}{self._place}{f'@{self._revision}' if self._revision else ''}"
+        self._repo: Any = {
+            "repo_id": self._place,
+            "repo_type": "dataset" if self.kind == "dataset" else "model",
+        }
+        self.name = (
+            f"hf://{found[1] or ''}{self._place}{f'@{self._revision}' if self._revision else ''}"
+        )
         self.quiet = quiet
         _use_client()
         self._api = HfApi(library_name="manip_il")
@@ -127,14 +164,23 @@ class Hub:
                 return None
             head = about.sha or ""
             if not _COMMIT.fullmatch(head):  # becomes part of paths
-                raise RemoteError(f"{self.name} names the commit {checks.shorten(head)}; is HF_ENDPOINT a Hub?")
+                raise RemoteError(
+                    f"{self.name} names the commit {checks.shorten(head)}; is HF_ENDPOINT a Hub?"
+                )
             tree = self._api.list_repo_tree(**self._repo, revision=head, recursive=True)
             listed = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
             if missing := {entry.rfilename for entry in about.siblings or ()} - listed.keys():
-                text = f"its list of files lacks {checks.shorten(min(missing))}, which the commit has; try again"
+                text = (
+                    f"its list of files lacks {checks.shorten(min(missing))}, which the commit has;"
+                    " try again"
+                )
                 raise RemoteError(f"{self.name}: {text}")
             files = {
-                path: File(entry.lfs.size, entry.lfs.sha256) if entry.lfs else File(entry.size, git_sha1=entry.blob_id)
+                path: (
+                    File(entry.lfs.size, entry.lfs.sha256)
+                    if entry.lfs
+                    else File(entry.size, git_sha1=entry.blob_id)
+                )
                 for path, entry in listed.items()
                 if not _HIDDEN.match(path) and path != MANIFEST_FILE
             }
@@ -144,16 +190,26 @@ class Hub:
 
     def _copies(self, paths: Collection[str]) -> dict[str, str]:
         """Return which files of a run's policy are copied to the root, name -> path."""
-        folder = policy_folder(path for path in paths if path != CONFIG) if self.kind == "policy" else None
-        inside = {Path(path).name: path for path in paths if folder and str(Path(path).parent) == folder}
+        folder = (
+            policy_folder(path for path in paths if path != CONFIG)
+            if self.kind == "policy"
+            else None
+        )
+        inside = {
+            Path(path).name: path for path in paths if folder and str(Path(path).parent) == folder
+        }
         return {name: path for name, path in inside.items() if name != CARD}
 
     def pushed(self, before: Manifest) -> dict[str, File]:
-        """Return the files of a version that a push wrote, by its manifest in the repository, without an edited card.
+        """Return the files of a version that a push wrote, by its manifest in the repository,
+        without an edited card.
 
         Without a manifest these are the folders of a dataset.
         """
-        with tempfile.TemporaryDirectory(prefix="manip_il_manifest_") as folder, explained(f"read {self.name}"):
+        with (
+            tempfile.TemporaryDirectory(prefix="manip_il_manifest_") as folder,
+            explained(f"read {self.name}"),
+        ):
             try:
                 self.download(before, Path(folder), MANIFEST_FILE)
             except RemoteEntryNotFoundError:
@@ -167,7 +223,9 @@ class Hub:
                     del pushed[CARD]
             return pushed
 
-    def with_card(self, source: Path, local: Mapping[str, Path], folder: Path, keeps: bool) -> dict[str, Path]:
+    def with_card(
+        self, source: Path, local: Mapping[str, Path], folder: Path, keeps: bool
+    ) -> dict[str, Path]:
         """Return the files to push: `local`, a card, and a run's policy at the root.
 
         Args:
@@ -185,11 +243,15 @@ class Hub:
         return {**local, **added}
 
     def write(self, plan: PushPlan) -> None:
-        """Commit on top of `plan.before` (the Hub refuses if it is outdated), then move a dataset's tag."""
+        """Commit on top of `plan.before` (the Hub refuses if it is outdated), then move a
+        dataset's tag.
+        """
         with explained(f"push to {self.name}"), _bounded():
             before, gone = plan.before or self._create(), plan.remove
             if plan.before is None:  # a new branch begins with the files of the main branch
-                gone = sorted(before.files.keys() & self.pushed(before).keys() - plan.manifest.files.keys())
+                gone = sorted(
+                    before.files.keys() & self.pushed(before).keys() - plan.manifest.files.keys()
+                )
             operations = [
                 *(CommitOperationAdd(path, str(plan.local[path])) for path in plan.upload),
                 *(CommitOperationDelete(path, is_folder=False) for path in gone),
@@ -197,7 +259,9 @@ class Hub:
             on: Any = {"revision": self._revision, "parent_commit": before.version}
             if operations:
                 operations.append(CommitOperationAdd(MANIFEST_FILE, plan.manifest.to_json()))
-                self._api.create_commit(**self._repo, operations=operations, commit_message="manip-il push", **on)
+                self._api.create_commit(
+                    **self._repo, operations=operations, commit_message="manip-il push", **on
+                )
             if self.kind == "dataset" and self._revision in (None, "main"):
                 self._move_tag()
 
@@ -211,17 +275,24 @@ class Hub:
             self._api.hf_hub_download(filename=path, force_download=True, **where)
 
     def _create(self) -> Manifest:
-        """Create the repository and the branch; return the branch's content: empty, or as on the main branch."""
+        """Create the repository and the branch.
+
+        Return the branch's content: empty, or as on the main branch.
+        """
         self._api.create_repo(**self._repo, private=self._private, exist_ok=True)
         if self._revision:
             self._api.create_branch(**self._repo, branch=self._revision, exist_ok=True)
         made = self.read()
         if made is None or (made.files and not self._revision):
-            raise RemoteError(f"{self.name} was created by another push in the meantime; push again")
+            raise RemoteError(
+                f"{self.name} was created by another push in the meantime; push again"
+            )
         return made
 
     def _move_tag(self) -> None:
-        """Delete LeRobot's tag and create it again on the main branch, because the Hub cannot move tags."""
+        """Delete LeRobot's tag and create it again on the main branch, because the Hub cannot
+        move tags.
+        """
         refs = self._api.list_repo_refs(**self._repo)
         [head] = [branch.target_commit for branch in refs.branches if branch.name == "main"]
         tags = [tag.target_commit for tag in refs.tags if tag.name == VERSION]
@@ -232,7 +303,9 @@ class Hub:
 
 
 def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, Path]:
-    """Write a card; return it by its path in the repository, or {} if `root` has one that is not ours.
+    """Write a card.
+
+    Return it by its path in the repository, or {} if `root` has one that is not ours.
 
     Args:
         root: A dataset, run or policy.
@@ -263,10 +336,16 @@ def _shown(value: Any) -> Any:
 
 
 def policy_facts(root: Path) -> dict[str, Any]:
-    """Return the template's values for a policy or its run. Raises `ManipError` if there is no policy."""
+    """Return the template's values for a policy or its run.
+
+    Raises `ManipError` if there is no policy.
+    """
     inside = policy_folder(path.relative_to(root).as_posix() for path in root.rglob(CONFIG))
     if inside is None:
-        raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")
+        raise ManipError(
+            f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model"
+            " folder"
+        )
     facts: dict[str, Any] = {}
     for name in ("config", "manip_il", "train_config"):
         path = root / inside / f"{name}.json"
@@ -277,7 +356,9 @@ def policy_facts(root: Path) -> dict[str, Any]:
     evaluations = [  # of this policy, undisturbed, and not on the seeds that chose it
         result
         for path in root.rglob("eval.json")
-        if not any(part.startswith(("round_", "validation")) for part in path.relative_to(root).parts)
+        if not any(
+            part.startswith(("round_", "validation")) for part in path.relative_to(root).parts
+        )
         and (result := checks.read_json(path, "JSON")).get("policy_sha256") == own
         and result.get("settings", {}).get("suite", NOMINAL.name) == NOMINAL.name
     ]

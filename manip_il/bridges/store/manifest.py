@@ -1,4 +1,7 @@
-"""The files of one version of a dataset or run, with sizes and hashes; what arrives of them is counted."""
+"""The files of one version of a dataset or run, with sizes and hashes.
+
+What arrives of them is counted.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +23,18 @@ from manip_il.data.lerobot_layout import INFO
 
 MANIFEST_FILE = "manip_il_manifest.json"
 JOURNALS = "journals"  # name of a folder of journals, in a pushed dataset or anywhere in a run
-CHECKPOINTS, LAST = "checkpoints", "last"  # the link `last` to the newest checkpoint is not pushed; a pull creates it
-CARD, CONFIG = "README.md", "config.json"  # the first once per repository, the second once per policy
+# the link `last` to the newest checkpoint is not pushed; a pull creates it
+CHECKPOINTS, LAST = "checkpoints", "last"
+# the first once per repository, the second once per policy
+CARD, CONFIG = "README.md", "config.json"
 _POLICIES = ("pretrained_model", "best/pretrained_model")
 _CHECKPOINT = re.compile(rf"{CHECKPOINTS}/\d+/pretrained_model")
 _LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
-_DATA = re.compile(  # names of files that hold data; all others could be code, or pickles, which can run code
-    r".*\.(json|jsonl|ya?ml|toml|txt|md|csv|tsv|log|html|pdf|png|jpe?g|gif|webp|svg|mp4|parquet|arrow|mcap|safetensors|"
-    r"npz|npy|onnx|wandb|xml|urdf|stl|obj|mtl|bib)|LICENSE|NOTICE|events\.out\.tfevents\.[\w.-]+\.\d+",
+# names of files that hold data; all others could be code, or pickles, which can run code
+_DATA = re.compile(
+    r".*\.(json|jsonl|ya?ml|toml|txt|md|csv|tsv|log|html|pdf|png|jpe?g|gif|webp|svg|mp4"
+    r"|parquet|arrow|mcap|safetensors|npz|npy|onnx|wandb|xml|urdf|stl|obj|mtl|bib)"
+    r"|LICENSE|NOTICE|events\.out\.tfevents\.[\w.-]+\.\d+",
     re.I,
 )
 
@@ -46,19 +53,28 @@ class File:
         """Raise `ManipError` for an invalid size or hash."""
         checks.whole("the size of a remote file", self.size, 0, 2**63)
         if not re.fullmatch("[0-9a-f]{64}|git:[0-9a-f]{40}", self.sha256 or f"git:{self.git_sha1}"):
-            raise RemoteError(f"a remote file has the hash {checks.shorten(self.sha256)}; expected hexadecimal digits")
+            raise RemoteError(
+                f"a remote file has the hash {checks.shorten(self.sha256)}; expected hexadecimal"
+                " digits"
+            )
 
     @classmethod
     def of(cls, path: Path) -> File:
         """Return a file's size and sha256."""
         with checks.open_outside(path, "a file") as file:
-            return cls(os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest())
+            return cls(
+                os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
+            )
 
     def fits(self, path: Path) -> bool:
         """Return whether a regular file has this size and hash."""
         if path.is_symlink() or not path.is_file() or path.stat().st_size != self.size:
             return False
-        digest = hashlib.sha256() if self.sha256 else hashlib.sha1(b"blob %d\0" % self.size, usedforsecurity=False)
+        digest = (
+            hashlib.sha256()
+            if self.sha256
+            else hashlib.sha1(b"blob %d\0" % self.size, usedforsecurity=False)
+        )
         with checks.open_outside(path, "a file") as file:
             hashlib.file_digest(file, lambda: digest)
         return digest.hexdigest() == (self.sha256 or self.git_sha1)
@@ -68,8 +84,8 @@ class File:
 class Manifest:
     """Files by path. version: the version's id on the remote.
 
-    copies: paths at the root that repeat the files of a run's policy; they are not pulled. replaced: hashes of objects
-    that only the version before names.
+    copies: paths at the root that repeat the files of a run's policy; they are not pulled.
+    replaced: hashes of objects that only the version before names.
     """
 
     kind: Kind
@@ -85,7 +101,10 @@ class Manifest:
 
     def to_json(self) -> bytes:
         """Return the content of the manifest file."""
-        files = [{"path": path, "size": one.size, "sha256": one.sha256} for path, one in sorted(self.files.items())]
+        files = [
+            {"path": path, "size": one.size, "sha256": one.sha256}
+            for path, one in sorted(self.files.items())
+        ]
         table = {"version": 1, "kind": self.kind, "files": files, "replaced": sorted(self.replaced)}
         return json.dumps(table, indent=1).encode()
 
@@ -95,7 +114,9 @@ class Manifest:
         table = checks.parse_json("the manifest", data)
         try:
             if table["version"] != 1 or table["kind"] not in ("dataset", "policy"):
-                raise RemoteError("the manifest was written by another version of manip-il; use a newer one")
+                raise RemoteError(
+                    "the manifest was written by another version of manip-il; use a newer one"
+                )
             files = {one["path"]: File(one["size"], one["sha256"]) for one in table["files"]}
             replaced = frozenset(File(0, sha256).sha256 for sha256 in table.get("replaced", ()))
             return cls(table["kind"], files, version, replaced=replaced)
@@ -105,7 +126,9 @@ class Manifest:
 
 @dataclass(frozen=True)
 class PushPlan:
-    """Difference between a folder and the remote's version (`before`). local: path -> file. upload, remove: paths."""
+    """Difference between a folder and the remote's version (`before`). local: path -> file.
+    upload, remove: paths.
+    """
 
     manifest: Manifest
     before: Manifest | None
@@ -117,7 +140,8 @@ class PushPlan:
 class Arrival(Callback):
     """Counts the bytes of one file. Raises `RemoteError` as soon as they are more than `most`.
 
-    fsspec updates it as a callback. huggingface_hub calls it for a new progress bar, and updates that.
+    fsspec updates it as a callback. huggingface_hub calls it for a new progress bar, and updates
+    that.
     """
 
     def __init__(self, most: int):
@@ -128,7 +152,9 @@ class Arrival(Callback):
     def call(self, *hook: Any, **given: Any) -> None:
         """Raise `RemoteError` if there are too many bytes."""
         if self.value > self.most:
-            raise RemoteError(f"it sends more than the {self.most:,} bytes that were expected; nothing was kept")
+            raise RemoteError(
+                f"it sends more than the {self.most:,} bytes that were expected; nothing was kept"
+            )
 
     def __call__(self, *given: Any, **options: Any) -> Arrival:
         """Return the bar, for huggingface_hub."""
@@ -140,18 +166,32 @@ class Arrival(Callback):
 
 
 def check_path(path: object) -> None:
-    """Raise `RemoteError` for a path that leads outside its folder, is hidden, or is not of a known kind of data."""
-    parts = path.split("/") if isinstance(path, str) and path.isprintable() and "\\" not in path else [""]
-    if not all(part and not part.startswith(".") for part in parts) or not _DATA.fullmatch(parts[-1]):
-        expected = "the relative path of a file of data (such as .json, .parquet, .safetensors), no pickle, no code"
-        raise RemoteError(f"the file {checks.shorten(path)} is refused; expected {expected}, not hidden")
+    """Raise `RemoteError` for a path that leads outside its folder, is hidden, or is not of a
+    known kind of data.
+    """
+    parts = (
+        path.split("/")
+        if isinstance(path, str) and path.isprintable() and "\\" not in path
+        else [""]
+    )
+    if not all(part and not part.startswith(".") for part in parts) or not _DATA.fullmatch(
+        parts[-1]
+    ):
+        expected = (
+            "the relative path of a file of data (such as .json, .parquet, .safetensors), no"
+            " pickle, no code"
+        )
+        raise RemoteError(
+            f"the file {checks.shorten(path)} is refused; expected {expected}, not hidden"
+        )
 
 
 def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, Path]:
-    """Return the files of a dataset or run by their paths in the manifest, except hidden and unfinished ones.
+    """Return the files of a dataset or run by their paths in the manifest, except hidden and
+    unfinished ones.
 
-    journals: include a dataset's `<root>.journals`, as `journals/`, and the journals in a run. Raises `RemoteError` for
-    links.
+    journals: include a dataset's `<root>.journals`, as `journals/`, and the journals in a run.
+    Raises `RemoteError` for links.
     """
     local: dict[str, Path] = {}
     for path in sorted(root.rglob("*")):
@@ -160,7 +200,9 @@ def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, P
             continue
         if path.is_symlink():
             if parts[-2:] != (CHECKPOINTS, LAST):
-                raise RemoteError(f"{path} is a link; links are not pushed: replace it with the file itself")
+                raise RemoteError(
+                    f"{path} is a link; links are not pushed: replace it with the file itself"
+                )
         elif path.is_file():
             local["/".join(parts)] = path
     if journals and kind == "dataset" and (beside := journals_of(root)).is_dir():
@@ -171,11 +213,14 @@ def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, P
 def datasets_in(folder: Path) -> list[Path]:
     """Return the datasets in a folder: the folder itself, or those of a run's rounds."""
     found = [path.parents[1] for path in folder.rglob(INFO)]
-    return sorted(root for root in found if not any(map(_LEFT_OUT.fullmatch, root.relative_to(folder).parts)))
+    return sorted(
+        root for root in found if not any(map(_LEFT_OUT.fullmatch, root.relative_to(folder).parts))
+    )
 
 
 def policy_folder(paths: Iterable[str]) -> str | None:
-    """Return the folder of a run's policy, given the paths of the run's files: "" for the root, None if there is none.
+    """Return the folder of a run's policy, given the paths of the run's files: "" for the root,
+    None if there is none.
 
     The policy is the best one, if the run has chosen one, else that of the newest checkpoint.
     """

@@ -1,10 +1,11 @@
-"""Remotes other than the Hub, through fsspec: objects named by the sha256 of their bytes, and one manifest.
+"""Remotes other than the Hub, through fsspec: objects named by the sha256 of their bytes, and one
+manifest.
 
-    PLACE/manip_il_manifest.json       replaced last, atomically: readers see the old version or the new one
+    PLACE/manip_il_manifest.json       replaced last, atomically: readers see one version
          /objects/3f/3f9a...           each file's bytes, never changed
 
-Objects of the previous version stay until the next push, so that its readers can finish: the manifest lists them, and
-nothing else is ever removed.
+Objects of the previous version stay until the next push, so that its readers can finish: the
+manifest lists them, and nothing else is ever removed.
 """
 
 import hashlib
@@ -31,13 +32,16 @@ from manip_il.bridges.store.manifest import MANIFEST_FILE, Arrival, Kind, Manife
 from manip_il.errors import UnknownName, UsageError
 
 TIMEOUT = 30.0  # for connecting to an ssh server, and for each response [s]
-_FRESH = {"skip_instance_cache": True, "use_listings_cache": False}  # for object stores: no stale listings
+# for object stores: no stale listings
+_FRESH = {"skip_instance_cache": True, "use_listings_cache": False}
 _S3 = {"max_concurrency": 4, "config_kwargs": {"read_timeout": 120}, **_FRESH}
 _OPTIONS: dict[str, dict[str, Any]] = {"file": {"auto_mkdir": True}, "s3": _S3, "sftp": {}}
 _SFTP = re.compile(
-    r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)(:[1-5]?\d{1,4}|:6[0-4]\d{3}|:65[0-4]\d{2}|:655[0-2]\d|:6553[0-5])?/[^@]+"
+    r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)"
+    r"(:[1-5]?\d{1,4}|:6[0-4]\d{3}|:65[0-4]\d{2}|:655[0-2]\d|:6553[0-5])?/[^@]+"
 )
-# concurrent files; s3fs has ten connections, and keeps up to 200 MB of every file in memory that it sends
+# concurrent files; s3fs has ten connections, and keeps up to 200 MB of every file in memory that it
+# sends
 _AT_ONCE = 10
 _SENT_AT_ONCE = 5
 _CHUNK = 2**20  # [bytes]
@@ -54,15 +58,23 @@ class Local(LocalFileSystem):
 
 
 class Sftp(SFTPFileSystem):
-    """SFTP with the user's ~/.ssh/config, to hosts in ~/.ssh/known_hosts only; fsspec's class accepts any host key."""
+    """SFTP with the user's ~/.ssh/config, to hosts in ~/.ssh/known_hosts only.
+
+    Fsspec's class accepts any host key.
+    """
 
     cachable = False
     put: Any = fsspec.AbstractFileSystem.put  # fsspec's SFTP class can put only a single file
 
     def _connect(self) -> None:
-        logging.getLogger("paramiko").setLevel(logging.CRITICAL)  # paramiko also raises the errors that it logs
+        # paramiko also raises the errors that it logs
+        logging.getLogger("paramiko").setLevel(logging.CRITICAL)
         config, login = Path.home() / ".ssh" / "config", self.ssh_kwargs
-        known = dict(paramiko.SSHConfig.from_path(str(config)).lookup(self.host)) if config.is_file() else {}
+        known = (
+            dict(paramiko.SSHConfig.from_path(str(config)).lookup(self.host))
+            if config.is_file()
+            else {}
+        )
         self.client = paramiko.SSHClient()
         self.client.load_system_host_keys()
         self.client.set_missing_host_key_policy(paramiko.RejectPolicy())
@@ -78,7 +90,9 @@ class Sftp(SFTPFileSystem):
         self.ftp.get_channel().settimeout(TIMEOUT)  # pyright: ignore[reportOptionalMemberAccess]
 
     @override
-    def put_file(self, lpath: Any, rpath: Any, callback: Any = None, mode: str = "", **kwargs: Any) -> None:
+    def put_file(
+        self, lpath: Any, rpath: Any, callback: Any = None, mode: str = "", **kwargs: Any
+    ) -> None:
         """Upload a file and make its folder."""
         self.makedirs(self._parent(rpath), exist_ok=True)
         self.ftp.put(str(lpath), str(rpath))
@@ -104,7 +118,9 @@ class Objects:
     kind: Kind | None = None  # the address does not say which
 
     def __init__(self, scheme: str, url: str, *, quiet: bool = False):
-        """Raises `UsageError` for an unknown scheme, one whose package is not installed, or an invalid address."""
+        """Raises `UsageError` for an unknown scheme, one whose package is not installed, or an
+        invalid address.
+        """
         self._scheme, self.quiet = scheme, quiet
         self.name = re.sub(r"(?<=://)([^/@:]*):.*@", r"\1@", url)
         try:
@@ -116,10 +132,16 @@ class Objects:
             known = ("hf://", "s3://", "sftp://", "file://", "gs://", "az://")
             raise UnknownName("scheme", f"{scheme}://", known) from None
         if scheme == "sftp" and not _SFTP.fullmatch(url):
-            text = "expected sftp://[USER@]HOST[:PORT]/FOLDER; in a password write / as %2F, @ as %40, : as %3A"
+            text = (
+                "expected sftp://[USER@]HOST[:PORT]/FOLDER; in a password write / as %2F, @ as %40,"
+                " : as %3A"
+            )
             raise UsageError(f"the sftp:// address is invalid; {text}")
         self.at_once = _AT_ONCE if self._class.async_impl else 1
-        self._login, place = self._class._get_kwargs_from_urls(url), self._class._strip_protocol(url)
+        self._login, place = (
+            self._class._get_kwargs_from_urls(url),
+            self._class._strip_protocol(url),
+        )
         self._root = place.removeprefix("/~/").rstrip("/")  # relative to the user's home
         self._manifest = f"{self._root}/{MANIFEST_FILE}"
 
@@ -135,7 +157,9 @@ class Objects:
             except (FileNotFoundError, NotADirectoryError):
                 return None
             with tempfile.NamedTemporaryFile() as arrived:
-                self._fs.get_file(self._manifest, arrived.name, callback=Arrival(checks.LARGEST_READ))
+                self._fs.get_file(
+                    self._manifest, arrived.name, callback=Arrival(checks.LARGEST_READ)
+                )
                 data = arrived.read()
             return Manifest.from_json(data, info.get("ETag") or hashlib.sha256(data).hexdigest())
 
@@ -143,34 +167,56 @@ class Objects:
         """Upload missing objects, then replace the manifest and remove unused objects."""
         with explained(f"push to {self.name}"):
             found = self._fs.find(f"{self._root}/objects", detail=True)
-            if links := [name for name, info in found.items() if info.get("islink") or info["type"] == "link"]:
-                raise RemoteError(f"{links[0]} is a link, and nothing is written through links; remove it there")
+            if links := [
+                name for name, info in found.items() if info.get("islink") or info["type"] == "link"
+            ]:
+                raise RemoteError(
+                    f"{links[0]} is a link, and nothing is written through links; remove it there"
+                )
             there = {name.rpartition("/")[2]: info["size"] for name, info in found.items()}
             files = plan.manifest.files
-            missing = {file.sha256: path for path, file in files.items() if there.get(file.sha256) != file.size}
+            missing = {
+                file.sha256: path
+                for path, file in files.items()
+                if there.get(file.sha256) != file.size
+            }
             sources = [str(plan.local[path]) for path in missing.values()]
-            bar = TqdmCallback({"desc": "push", "unit": " files", "disable": True if self.quiet else None})
+            bar = TqdmCallback(
+                {"desc": "push", "unit": " files", "disable": True if self.quiet else None}
+            )
             at_once = {"batch_size": _SENT_AT_ONCE} if self._fs.async_impl else {}
             self._fs.put(sources, [self._object(key) for key in missing], callback=bar, **at_once)
             for path in missing.values():
                 if plan.local[path].stat().st_size != files[path].size:
-                    raise RemoteError(f"{plan.local[path]} was modified during the push; push again")
+                    raise RemoteError(
+                        f"{plan.local[path]} was modified during the push; push again"
+                    )
             before = plan.before or Manifest(plan.manifest.kind, {})
             if files != before.files:
-                old, new = ({file.sha256 for file in version.values()} for version in (before.files, files))
+                old, new = (
+                    {file.sha256 for file in version.values()} for version in (before.files, files)
+                )
                 unused = (before.replaced & there.keys()) - old - new
-                self._switch(replace(plan.manifest, replaced=frozenset(old - new | unused)), before.version)
+                self._switch(
+                    replace(plan.manifest, replaced=frozenset(old - new | unused)), before.version
+                )
                 with suppress(FileNotFoundError):  # another push removes them, too
                     if unused:
                         self._fs.rm([self._object(key) for key in unused])
 
     def download(self, manifest: Manifest, folder: Path, path: str) -> None:
-        """Download the object of a file to the file's path in a folder, without checking its hash."""
+        """Download the object of a file to the file's path in a folder, without checking its
+        hash.
+        """
         file = manifest.files[path]
-        self._fs.get_file(self._object(file.sha256), str(folder / path), callback=Arrival(file.size))
+        self._fs.get_file(
+            self._object(file.sha256), str(folder / path), callback=Arrival(file.size)
+        )
 
     def _switch(self, new: Manifest, before: str) -> None:
-        """Replace the manifest if its version is still `before`: on S3 atomically, elsewhere after one more look."""
+        """Replace the manifest if its version is still `before`: on S3 atomically, elsewhere
+        after one more look.
+        """
 
         def is_outdated() -> bool:
             return getattr(self.read(), "version", "") != before
@@ -184,7 +230,9 @@ class Objects:
                 self._fs.mv(partial, self._manifest)
             else:
                 condition = {"IfMatch": before} if before else {"IfNoneMatch": "*"}
-                self._fs.pipe_file(self._manifest, new.to_json(), **(condition if self._scheme == "s3" else {}))
+                self._fs.pipe_file(
+                    self._manifest, new.to_json(), **(condition if self._scheme == "s3" else {})
+                )
         except OSError as error:
             if is_outdated():  # or this push succeeded, and its answer was lost
                 text = "was changed by another push in the meantime; push again"

@@ -1,4 +1,7 @@
-"""Push a folder to a remote, checked and visible only when complete; pull it back, verified, in one rename."""
+"""Push a folder to a remote, checked and visible only when complete.
+
+Pull it back, verified, in one rename.
+"""
 
 import filecmp
 import re
@@ -39,22 +42,31 @@ _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://(.*[^/].*)")
 _OF_A_RUN = ("config.yaml", "config.json", "eval.json", "checkpoints", "best")
 
 
-def open_remote(url: str, *, revision: str | None = None, private: bool = False, quiet: bool = False) -> Hub | Objects:
+def open_remote(
+    url: str, *, revision: str | None = None, private: bool = False, quiet: bool = False
+) -> Hub | Objects:
     """Return the remote of a URL, without connecting yet. Raises `UsageError` for an invalid URL.
 
-    revision: branch, tag or commit on the Hub. private: whether a push creates a private repository on the Hub.
+    revision: branch, tag or commit on the Hub. private: whether a push creates a private repository
+    on the Hub.
     """
     found = _ADDRESS.fullmatch(url)
     if not found:
-        raise UsageError("the remote is not a URL; expected one such as hf://datasets/USER/NAME or file://FOLDER")
+        raise UsageError(
+            "the remote is not a URL; expected one such as hf://datasets/USER/NAME or file://FOLDER"
+        )
     if found[1] == "hf":
         return Hub(found[2], revision, private=private, quiet=quiet)
     if revision is not None:
-        raise UsageError(f"--revision={revision} is only for the Hub; other remotes hold one version")
+        raise UsageError(
+            f"--revision={revision} is only for the Hub; other remotes hold one version"
+        )
     return Objects(found[1], url, quiet=quiet)
 
 
-def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run: bool = False) -> PushPlan:
+def push(
+    source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run: bool = False
+) -> PushPlan:
     """Push a folder; return the differences.
 
     Args:
@@ -86,10 +98,16 @@ def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run
         old = pushed = before.files if before else {}
         if isinstance(remote, Hub):  # other remotes hold the folder unchanged, and nothing else
             pushed = remote.pushed(before) if before else {}
-            local = remote.with_card(source, local, Path(folder), keeps=CARD in old.keys() - pushed.keys())
+            local = remote.with_card(
+                source, local, Path(folder), keeps=CARD in old.keys() - pushed.keys()
+            )
         with ThreadPoolExecutor() as pool:
             new = dict(zip(local, pool.map(File.of, local.values()), strict=True))
-        same = {path for path in old.keys() & new.keys() if old[path] == new[path] or old[path].fits(local[path])}
+        same = {
+            path
+            for path in old.keys() & new.keys()
+            if old[path] == new[path] or old[path].fits(local[path])
+        }
         plan = PushPlan(
             manifest=Manifest(kind, new),
             before=before,
@@ -102,8 +120,12 @@ def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run
     return plan
 
 
-def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_run: bool = False) -> Manifest:
-    """Download the remote's current version to `target`, completely or not at all; return its manifest.
+def pull(
+    remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_run: bool = False
+) -> Manifest:
+    """Download the remote's current version to `target`, completely or not at all.
+
+    Return its manifest.
 
     Args:
         remote: Where from.
@@ -118,7 +140,10 @@ def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_ru
     """
     manifest = remote.read()
     if manifest is None or not manifest.files:
-        text = "check the address (of a dataset on the Hub: hf://datasets/USER/NAME), log in if it is private, or push"
+        text = (
+            "check the address (of a dataset on the Hub: hf://datasets/USER/NAME), log in if it is"
+            " private, or push"
+        )
         raise RemoteError(f"{remote.name} holds nothing that can be pulled; {text} there first")
     files = {path: file for path, file in manifest.files.items() if path not in manifest.copies}
     manifest = replace(manifest, files=files)
@@ -151,16 +176,25 @@ def _place_journals(arrived: Path, beside: Path, replaces: str) -> None:
 
 
 def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest) -> None:
-    """Download all files of a version into a folder, verify their hashes, and open datasets in a child process."""
+    """Download all files of a version into a folder, verify their hashes, and open datasets in a
+    child process.
+    """
     files = manifest.files
     for path in files:
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
     with explained(f"pull from {remote.name}"), ThreadPoolExecutor(remote.at_once) as pool:
         arriving = pool.map(partial(remote.download, manifest, folder), files)
-        list(tqdm(arriving, "pull", len(files), unit=" files", disable=True if remote.quiet else None))
-    shutil.rmtree(folder / ".cache", ignore_errors=True)  # huggingface_hub's records of the download
+        list(
+            tqdm(
+                arriving, "pull", len(files), unit=" files", disable=True if remote.quiet else None
+            )
+        )
+    # huggingface_hub's records of the download
+    shutil.rmtree(folder / ".cache", ignore_errors=True)
     with ThreadPoolExecutor() as pool:
-        for path, is_right in zip(files, pool.map(lambda path: files[path].fits(folder / path), files), strict=True):
+        for path, is_right in zip(
+            files, pool.map(lambda path: files[path].fits(folder / path), files), strict=True
+        ):
             if not is_right:
                 text = f"{checks.shorten(path)} has the wrong hash; nothing was kept; pull again"
                 raise RemoteError(f"{remote.name}: {text}, or push again, to an empty folder")

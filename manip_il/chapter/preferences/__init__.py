@@ -1,1 +1,3 @@
-"""Rewards from preferences between clips: choosing pairs, collecting answers, fitting a reward, scoring datasets."""
+"""Rewards from preferences between clips: choosing pairs, collecting answers, fitting a reward,
+scoring datasets.
+"""

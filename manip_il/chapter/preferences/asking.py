@@ -26,11 +26,13 @@ _CAMERA = "front"
 Films = list[list[bytes]]  # MP4s of each pair, left and right
 
 
-def render_films(clips: Clips, robot: Path | None = None, on_pair: Callable[[], None] = lambda: None) -> Films:
+def render_films(
+    clips: Clips, robot: Path | None = None, on_pair: Callable[[], None] = lambda: None
+) -> Films:
     """Return MP4s of the left and right clip of every pair.
 
-    robot: YAML of the sources' robot, if it is not a built-in one. Raises `RenderError` without off-screen OpenGL and
-    `ManipError` for sources whose states cannot be rendered.
+    robot: YAML of the sources' robot, if it is not a built-in one. Raises `RenderError` without
+    off-screen OpenGL and `ManipError` for sources whose states cannot be rendered.
     """
     pairs = clips.pairs
     opened = [open_source(root, robot) for root in clips.roots]
@@ -41,7 +43,13 @@ def render_films(clips: Clips, robot: Path | None = None, on_pair: Callable[[], 
         films: list[bytes] = []
         for side, clip in enumerate(pair):
             rows = clips.rows[number, side] - clips.offsets[clip.source]
-            films.append(_film(opened[clip.source], states[clip.source][rows[::every]], pairs.control_hz // every))
+            films.append(
+                _film(
+                    opened[clip.source],
+                    states[clip.source][rows[::every]],
+                    pairs.control_hz // every,
+                )
+            )
         found.append(films)
         on_pair()
     return found
@@ -49,7 +57,9 @@ def render_films(clips: Clips, robot: Path | None = None, on_pair: Callable[[], 
 
 def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
     """Return the page as one string of HTML."""
-    script = (files("manip_il.chapter.preferences") / "templates" / "ask.js").read_text(encoding="utf-8")
+    script = (files("manip_il.chapter.preferences") / "templates" / "ask.js").read_text(
+        encoding="utf-8"
+    )
     data: dict[str, Any] = {
         "format": PREFERENCES,
         "version": VERSION,
@@ -57,7 +67,9 @@ def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
         "films": [[base64.b64encode(film).decode("ascii") for film in pair] for pair in films],
     }
     environment = Environment(
-        loader=PackageLoader("manip_il.chapter.preferences"), autoescape=True, undefined=StrictUndefined
+        loader=PackageLoader("manip_il.chapter.preferences"),
+        autoescape=True,
+        undefined=StrictUndefined,
     )
     return environment.get_template("ask.html.j2").render(
         title=f"{pairs.robot} {pairs.task}",

@@ -3,7 +3,8 @@
 It is fitted with the Bradley-Terry model of preferences between clips, in folds: every pair is held
 out from one of the networks.
 
-    P(left is better) = (1 - E) sigmoid(R(left) - R(right)) + E / 2,    R(clip) = sum over its steps of r(s, a)
+    P(left is better) = (1 - E) sigmoid(R(left) - R(right)) + E / 2
+    R(clip) = sum over its steps of r(s, a)
 
 (Bradley & Terry 1952; Christiano et al. 2017, section 2.2.3, where E = 0.1 is the share of answers
 that are random, whatever the clips.)
@@ -41,11 +42,14 @@ _ROWS = 8_192  # rows evaluated at a time
 
 @dataclass(frozen=True, eq=False)
 class FittedReward:
-    """Networks fitted to answers, and their agreement on held-out pairs; each network holds out some of the pairs.
+    """Networks fitted to answers, and their agreement on held-out pairs.
 
-    logits: R(left) - R(right) of every answer, (A,), by the network that held it out. epochs: number of epochs that
-    the networks were trained for. answered: agreement with the answers that are not `equal`; true: agreement with true
-    progress, without pairs that differ by less than `TIE`; None if the datasets have no progress.
+    Each network holds out some of the pairs.
+
+    logits: R(left) - R(right) of every answer, (A,), by the network that held it out. epochs:
+    number of epochs that the networks were trained for. answered: agreement with the answers that
+    are not `equal`; true: agreement with true progress, without pairs that differ by less than
+    `TIE`; None if the datasets have no progress.
     """
 
     network: RewardNetwork
@@ -64,12 +68,17 @@ class FittedReward:
 
 
 def fit_answers(
-    clips: Clips, answers: Answers, shape: RewardShape, seed: int, on_epoch: Callable[[], None] = lambda: None
+    clips: Clips,
+    answers: Answers,
+    shape: RewardShape,
+    seed: int,
+    on_epoch: Callable[[], None] = lambda: None,
 ) -> FittedReward:
     """Fit a reward and measure it on held-out pairs.
 
-    The pairs are split into as many folds as there are networks: network m holds out fold m and trains on the others.
-    All stop at the epoch with the lowest loss on the held-out folds. The same arguments give the same bits.
+    The pairs are split into as many folds as there are networks: network m holds out fold m and
+    trains on the others. All stop at the epoch with the lowest loss on the held-out folds. The same
+    arguments give the same bits.
 
     Args:
         clips: The pairs and their frames.
@@ -91,7 +100,11 @@ def fit_answers(
         network.std.copy_(features.std(0).clamp(min=1e-6))
         epochs = _train(network, inputs, sides, answers.better, folds, seed, on_epoch)
         with torch.no_grad():
-            logits = _logits(network, inputs, sides).numpy()[folds, np.arange(len(folds))].astype(np.float64)
+            logits = (
+                _logits(network, inputs, sides)
+                .numpy()[folds, np.arange(len(folds))]
+                .astype(np.float64)
+            )
             rewards = torch.cat([network.members(part).mean(0) for part in inputs.split(_ROWS)])
             every = max(1, len(rewards) // _MOST_FRAMES)
             low, high = torch.quantile(rewards[::every], torch.tensor(_RANGE)).tolist()
@@ -107,7 +120,10 @@ def fit_answers(
 
 
 def true_difference(clips: Clips) -> F64 | None:
-    """Return the mean true progress of each left clip minus that of the right one, (P,); None without progress."""
+    """Return the mean true progress of each left clip minus that of the right one, (P,).
+
+    None without progress.
+    """
     if clips.progress is None:
         return None
     means = clips.progress[clips.rows].mean(axis=-1)
@@ -117,9 +133,14 @@ def true_difference(clips: Clips) -> F64 | None:
 def summary_lines(found: FittedReward, answers: Answers) -> list[str]:
     """Return a summary of the answers and the fit as plain lines."""
     given = f"{len(answers.better):,} answers about {len(set(answers.pair.tolist())):,} pairs"
-    lines = [f"{given}, {answers.skipped:,} skipped", f"agreement with answers on held-out pairs: {found.answered}"]
+    lines = [
+        f"{given}, {answers.skipped:,} skipped",
+        f"agreement with answers on held-out pairs: {found.answered}",
+    ]
     if found.true is not None:
-        lines.append(f"agreement with true progress on held-out pairs: {found.true} of {found.true.n:,}")
+        lines.append(
+            f"agreement with true progress on held-out pairs: {found.true} of {found.true.n:,}"
+        )
     return lines
 
 
@@ -127,13 +148,18 @@ def deal(pair: I64, folds: int, seed: int) -> I64:
     """Return the fold of every answer, (A,); all answers about a pair are in the same fold."""
     names, place = np.unique(pair, return_inverse=True)
     if len(names) < folds:
-        raise ManipError(f"only {len(names)} pairs have an answer (left, right or equal); expected at least {folds}")
+        raise ManipError(
+            f"only {len(names)} pairs have an answer (left, right or equal); expected at least"
+            f" {folds}"
+        )
     order = np.random.default_rng([seed, 2]).permutation(len(names))
     return (order % folds)[place]
 
 
 def answer_losses(logits: Tensor, better: Tensor) -> Tensor:
-    """Return the negative log-likelihood of answers, (M, A), for logits (M, A) and targets `better` (A,)."""
+    """Return the negative log-likelihood of answers, (M, A), for logits (M, A) and targets
+    `better` (A,).
+    """
     p = (1 - BY_CHANCE) * torch.sigmoid(logits) + BY_CHANCE / 2
     return nn.functional.binary_cross_entropy(p, better.expand_as(p), reduction="none")
 
@@ -147,10 +173,13 @@ def _train(
     seed: int,
     on_epoch: Callable[[], None],
 ) -> int:
-    """Train all networks at once; restore the weights of the epoch with the lowest held-out loss and return its number.
+    """Train all networks at once.
 
-    Each network is evaluated on the fold that it holds out, so the mean loss covers every answer once. All stop at
-    the same epoch: a choice by a single fold of some 25 answers would be mostly noise.
+    Restore the weights of the epoch with the lowest held-out loss and return its number.
+
+    Each network is evaluated on the fold that it holds out, so the mean loss covers every answer
+    once. All stop at the same epoch: a choice by a single fold of some 25 answers would be mostly
+    noise.
     """
     left_out = torch.from_numpy(folds == np.arange(len(network.weights[0]))[:, None])
     learns = (~left_out).float()
@@ -163,7 +192,9 @@ def _train(
         for rows in torch.randperm(len(better), generator=generator).split(_BATCH):
             losses = answer_losses(_logits(network, inputs, sides[rows]), better[rows])
             optimizer.zero_grad(set_to_none=True)
-            ((losses * learns[:, rows]).sum(1) / learns[:, rows].sum(1).clamp(min=1)).sum().backward()
+            (
+                (losses * learns[:, rows]).sum(1) / learns[:, rows].sum(1).clamp(min=1)
+            ).sum().backward()
             optimizer.step()
         with torch.no_grad():
             losses = answer_losses(_logits(network, inputs, sides), better)
@@ -178,9 +209,13 @@ def _train(
 
 
 def _logits(network: RewardNetwork, inputs: Tensor, sides: Tensor) -> Tensor:
-    """R(left) - R(right) for every network, (M, A). sides: rows of `inputs` of both clips, (A, 2, L)."""
+    """R(left) - R(right) for every network, (M, A). sides: rows of `inputs` of both clips, (A,
+    2, L).
+    """
     rows = [sides[:, side] for side in (0, 1)]
-    left, right = (network.members(inputs[one.reshape(-1)]).view(-1, *one.shape).sum(-1) for one in rows)
+    left, right = (
+        network.members(inputs[one.reshape(-1)]).view(-1, *one.shape).sum(-1) for one in rows
+    )
     return left - right
 
 

@@ -1,9 +1,11 @@
-"""Pairs of clips to compare, chosen evenly or by disagreement of a reward's networks, and answers about them.
+"""Pairs of clips to compare, chosen evenly or by disagreement of a reward's networks, and answers
+about them.
 
 Pairs are stored as `pairs.json`, answers as `preferences.json`, by people or by simulated teachers.
 Teachers compare clips by true progress (B-Pref, Lee et al. 2021, section 3):
 
-    P(left is better) = sigmoid(beta (G(left) - G(right))),    G(clip) = sum over its steps of progress
+    P(left is better) = sigmoid(beta (G(left) - G(right)))
+    G(clip) = sum over its steps of progress
 
 The return G sums true progress over the clip's steps; B-Pref sums the task's reward. Progress is a
 property of the state, so a clip is better if it is closer to success or gets there faster.
@@ -75,7 +77,10 @@ class Frames:
 
 
 def read_frames(root: Path) -> Frames:
-    """Return the frames of a dataset. Raises `ManipError` if it lacks our columns or has non-finite numbers."""
+    """Return the frames of a dataset.
+
+    Raises `ManipError` if it lacks our columns or has non-finite numbers.
+    """
     dataset = Dataset.open(root)
     spec, present = dataset.spec, list(dataset.features)
     action = schema.EXECUTED_ACTION if schema.EXECUTED_ACTION in present else schema.ACTION
@@ -95,14 +100,19 @@ def read_frames(root: Path) -> Frames:
 
 
 def read_all(roots: Sequence[Path]) -> list[Frames]:
-    """Return the frames of datasets. Raises `MismatchError` unless they have the same task and columns."""
+    """Return the frames of datasets.
+
+    Raises `MismatchError` unless they have the same task and columns.
+    """
     found = [read_frames(root) for root in roots]
     check_same_sources(roots, [one.spec for one in found], pictures=False, language=False)
     return found
 
 
 def find_datasets(folders: Sequence[Path]) -> list[Path]:
-    """Return the datasets in folders: for a run the datasets of all its rounds, otherwise the folder itself."""
+    """Return the datasets in folders: for a run the datasets of all its rounds, otherwise the
+    folder itself.
+    """
     found: list[Path] = []
     for folder in folders:
         found += sorted(folder.glob(_ROUNDS)) or [folder]
@@ -111,7 +121,10 @@ def find_datasets(folders: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True)
 class Source:
-    """A dataset. root: its folder when the pairs were chosen, for messages alone; sha256: `dataset_sha256`."""
+    """A dataset. root: its folder when the pairs were chosen, for messages alone.
+
+    sha256: `dataset_sha256`.
+    """
 
     root: str
     sha256: str
@@ -120,7 +133,9 @@ class Source:
 
 
 class Clip(NamedTuple):
-    """The start of a clip: indices of the source, of an episode in it, and of the clip's first frame in the episode."""
+    """The start of a clip: indices of the source, of an episode in it, and of the clip's first
+    frame in the episode.
+    """
 
     source: int
     episode: int
@@ -131,8 +146,9 @@ class Clip(NamedTuple):
 class Pairs:
     """Pairs of clips, left and right, of equal length, from datasets of one task.
 
-    clip: length of every clip [control steps]. If lengths differed, the reward's constant offset, which comparisons do
-    not determine, would count more often for the longer clip. chosen: how the pairs were chosen, in words.
+    clip: length of every clip [control steps]. If lengths differed, the reward's constant offset,
+    which comparisons do not determine, would count more often for the longer clip. chosen: how the
+    pairs were chosen, in words.
     """
 
     robot: str
@@ -160,7 +176,9 @@ class Pairs:
     def from_json(cls, data: dict[str, Any]) -> Pairs:
         """Return the pairs that `to_json` has written."""
         pairs = tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"])
-        plain = {name: data[name] for name in ("robot", "task", "control_hz", "clip", "seed", "chosen")}
+        plain = {
+            name: data[name] for name in ("robot", "task", "control_hz", "clip", "seed", "chosen")
+        }
         return cls(**plain, sources=tuple(Source(**one) for one in data["sources"]), pairs=pairs)
 
     @classmethod
@@ -170,7 +188,10 @@ class Pairs:
 
 
 def read_file[Read](path: Path, form: str, make: Callable[[dict[str, Any]], Read]) -> Read:
-    """Return `make(content)` for a JSON file of a format. Raises `ManipError` for any other file."""
+    """Return `make(content)` for a JSON file of a format.
+
+    Raises `ManipError` for any other file.
+    """
     data = checks.read_json(path, form)
     with in_one_line(f"{path} holds no {form}"):
         if (data["format"], data["version"]) != (form, VERSION):
@@ -180,7 +201,9 @@ def read_file[Read](path: Path, form: str, make: Callable[[dict[str, Any]], Read
 
 @dataclass(frozen=True, eq=False)
 class Clips:
-    """Pairs together with their datasets, in the order of `Pairs.sources`, and the frames of those."""
+    """Pairs together with their datasets, in the order of `Pairs.sources`, and the frames of
+    those.
+    """
 
     pairs: Pairs
     roots: tuple[Path, ...]
@@ -200,24 +223,38 @@ class Clips:
     def progress(self) -> F64 | None:
         """True progress of all frames, (N,); None if a source has none."""
         found = [one.progress for one in self.frames]
-        return None if any(one is None for one in found) else np.concatenate([one for one in found if one is not None])
+        return (
+            None
+            if any(one is None for one in found)
+            else np.concatenate([one for one in found if one is not None])
+        )
 
     @cached_property
     def rows(self) -> I64:
         """Rows of `inputs` that hold the frames of the left and right clips, (P, 2, L)."""
         begin = [
-            [self.offsets[clip.source] + self.frames[clip.source].firsts[clip.episode] + clip.first for clip in pair]
+            [
+                self.offsets[clip.source]
+                + self.frames[clip.source].firsts[clip.episode]
+                + clip.first
+                for clip in pair
+            ]
             for pair in self.pairs.pairs
         ]
         return np.array(begin, np.int64).reshape(-1, 2, 1) + np.arange(self.pairs.clip)
 
 
 def join_pairs(given: Sequence[Pairs]) -> Pairs:
-    """Join the pairs of several files, numbered consecutively. Raises `MismatchError` if clip lengths differ."""
+    """Join the pairs of several files, numbered consecutively.
+
+    Raises `MismatchError` if clip lengths differ.
+    """
     first = given[0]
     for other in given[1:]:
         if first.clip != other.clip:
-            raise MismatchError("clip length", "the first file of pairs", first.clip, "another", other.clip)
+            raise MismatchError(
+                "clip length", "the first file of pairs", first.clip, "another", other.clip
+            )
     sources = tuple(dict.fromkeys(source for one in given for source in one.sources))
     joined: list[tuple[Clip, Clip]] = []
     for one in given:
@@ -233,7 +270,8 @@ def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
     """Return the clips of pairs.
 
     Args:
-        pairs: The pairs. The paths stored in them are never opened: their datasets are recognised by their hashes.
+        pairs: The pairs. The paths stored in them are never opened: their datasets are recognised
+            by their hashes.
         roots: Datasets that the user named, in any order, at least those of the pairs.
 
     Raises `ManipError` if a dataset of the pairs is missing or has changed since.
@@ -241,7 +279,9 @@ def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
     found = {dataset_sha256(root): root for root in roots}
     for source in pairs.sources:
         if source.sha256 not in found:
-            raise ManipError(f"the pairs' dataset {source.root} is not among the sources, or has changed since")
+            raise ManipError(
+                f"the pairs' dataset {source.root} is not among the sources, or has changed since"
+            )
     used = tuple(found[source.sha256] for source in pairs.sources)
     return Clips(pairs, used, tuple(read_all(used)))
 
@@ -254,11 +294,14 @@ def choose_pairs(
     rng: np.random.Generator,
     reward: LearnedReward | None = None,
 ) -> Clips:
-    """Choose pairs of clips of `length` control steps from datasets; episodes shorter than a clip are ignored.
+    """Choose pairs of clips of `length` control steps from datasets.
 
-    With `reward`, draw `POOL` times as many pairs, and keep those on which its networks disagree most, by the standard
-    deviation of P(left is better) (Christiano et al. 2017, section 2.2.4; Lee et al. 2021). Raises `MismatchError`
-    unless datasets and reward have the same task, `ManipError` if there are too few pairs.
+    Episodes shorter than a clip are ignored.
+
+    With `reward`, draw `POOL` times as many pairs, and keep those on which its networks disagree
+    most, by the standard deviation of P(left is better) (Christiano et al. 2017, section 2.2.4; Lee
+    et al. 2021). Raises `MismatchError` unless datasets and reward have the same task, `ManipError`
+    if there are too few pairs.
     """
     frames = tuple(read_all(roots))
     longest = max(int(one.lengths.max()) for one in frames)
@@ -268,7 +311,9 @@ def choose_pairs(
         reward.check_fits(str(roots[0]), frames[0].spec)
     drawn = _draw(frames, length, count * (1 if reward is None else POOL), rng)
     if len(drawn) < count:
-        raise ManipError(f"--count is {count}; only {len(drawn)} pairs of clips of {length} steps were found")
+        raise ManipError(
+            f"--count is {count}; only {len(drawn)} pairs of clips of {length} steps were found"
+        )
     spec = frames[0].spec
     made = Pairs(
         robot=spec.robot,
@@ -285,20 +330,29 @@ def choose_pairs(
     if reward is not None:
         spread = disagreement(Clips(made, tuple(roots), frames), reward.members)
         kept = np.sort(np.argsort(-spread, kind="stable")[:count])
-        made = replace(made, pairs=tuple(drawn[place] for place in kept), chosen="where rewards disagree")
+        made = replace(
+            made, pairs=tuple(drawn[place] for place in kept), chosen="where rewards disagree"
+        )
     return Clips(made, tuple(roots), frames)
 
 
 def disagreement(clips: Clips, members: Members) -> F64:
-    """Return the standard deviation of P(left is better) over the networks of an ensemble, one per pair, (P,)."""
+    """Return the standard deviation of P(left is better) over the networks of an ensemble, one
+    per pair, (P,).
+    """
     rows = clips.rows
     rewards = members(clips.inputs[rows.reshape(-1)])
     returns = rewards.reshape(len(rewards), *rows.shape).sum(-1)
     return expit(returns[:, :, 0] - returns[:, :, 1]).std(axis=0)
 
 
-def _draw(frames: Sequence[Frames], length: int, count: int, rng: np.random.Generator) -> list[tuple[Clip, Clip]]:
-    """Distinct pairs of clips; all sources appear equally often. Both clips may be from one source."""
+def _draw(
+    frames: Sequence[Frames], length: int, count: int, rng: np.random.Generator
+) -> list[tuple[Clip, Clip]]:
+    """Distinct pairs of clips; all sources appear equally often.
+
+    Both clips may be from one source.
+    """
     found = dict[tuple[Clip, Clip], None]()
     sources = [number for number, one in enumerate(frames) if one.lengths.max() >= length]
 
@@ -319,7 +373,10 @@ def _draw(frames: Sequence[Frames], length: int, count: int, rng: np.random.Gene
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer about a pair. pair: the pair's number. when: time in ISO 8601; None if a simulated teacher answered."""
+    """An answer about a pair. pair: the pair's number. when: time in ISO 8601.
+
+    None if a simulated teacher answered.
+    """
 
     pair: int
     answer: str
@@ -349,22 +406,32 @@ class Preferences:
 
     @classmethod
     def read(cls, path: Path, pairs: Sequence[Pairs]) -> Preferences:
-        """Return the answers in a file, with pair numbers that count across the pairs of all files, as in `join_pairs`.
+        """Return the answers in a file, with pair numbers that count across the pairs of all files,
+        as in `join_pairs`.
 
-        Raises `ManipError` for a file without answers, `MismatchError` for answers about other pairs.
+        Raises `ManipError` for a file without answers, `MismatchError` for answers about other
+        pairs.
         """
         found = read_file(path, PREFERENCES, cls.from_json)
-        place = next((number for number, one in enumerate(pairs) if one.sha256 == found.pairs), None)
+        place = next(
+            (number for number, one in enumerate(pairs) if one.sha256 == found.pairs), None
+        )
         if place is None:
             own = pairs[0].sha256
-            raise MismatchError("sha256 of the pairs", str(path), found.pairs[:12], "the file of pairs", own[:12])
+            raise MismatchError(
+                "sha256 of the pairs", str(path), found.pairs[:12], "the file of pairs", own[:12]
+            )
         before = sum(map(len, pairs[:place]))
-        return replace(found, answers=tuple(replace(one, pair=before + one.pair) for one in found.answers))
+        return replace(
+            found, answers=tuple(replace(one, pair=before + one.pair) for one in found.answers)
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """All answers except skips. pair: numbers of the pairs, (A,); better: the answers as numbers, see `BETTER`, (A,).
+    """All answers except skips. pair: numbers of the pairs, (A,).
+
+    better: the answers as numbers, see `BETTER`, (A,).
 
     skipped: number of `skip` answers.
     """
@@ -375,7 +442,10 @@ class Answers:
 
 
 def join_answers(given: Sequence[Preferences]) -> Answers:
-    """Join answers; two answers about one pair are two observations, even if they contradict each other."""
+    """Join answers.
+
+    Two answers about one pair are two observations, even if they contradict each other.
+    """
     every = [one for preferences in given for one in preferences.answers]
     kept = [one for one in every if one.answer != SKIP]
     return Answers(
@@ -389,7 +459,8 @@ def join_answers(given: Sequence[Preferences]) -> Answers:
 class Teacher:
     """One of `TEACHERS`, with B-Pref's parameters.
 
-    temperature: 1 / beta; if 0, the better clip is always chosen. epsilon: share of answers that are reversed.
+    temperature: 1 / beta; if 0, the better clip is always chosen. epsilon: share of answers that
+    are reversed.
     """
 
     name: str
@@ -398,7 +469,10 @@ class Teacher:
 
     @classmethod
     def parse(cls, text: str) -> Teacher:
-        """Parse `perfect`, `boltzmann[:TEMPERATURE]` or `mistaken[:SHARE]`; `UsageError` for anything else."""
+        """Parse `perfect`, `boltzmann[:TEMPERATURE]` or `mistaken[:SHARE]`.
+
+        `UsageError` for anything else.
+        """
         name, _, number = text.partition(":")
         if name not in TEACHERS:
             raise UnknownName("teacher", name, TEACHERS)
@@ -408,13 +482,20 @@ class Teacher:
         except ValueError:
             value = math.nan
         if not 0 <= value <= (1 if field == "epsilon" else math.inf):
-            raise UsageError(f"--teacher is {text!r}; expected perfect, boltzmann:TEMPERATURE or mistaken:SHARE")
+            raise UsageError(
+                f"--teacher is {text!r}; expected perfect, boltzmann:TEMPERATURE or mistaken:SHARE"
+            )
         return cls(text, **{field: value})
 
     def answers(self, clips: Clips, rng: np.random.Generator) -> list[str]:
-        """Return the teacher's answer about every pair. Raises `ManipError` if the sources have no true progress."""
+        """Return the teacher's answer about every pair.
+
+        Raises `ManipError` if the sources have no true progress.
+        """
         if clips.progress is None:
-            raise ManipError("the sources have no progress column, which teachers need; use manip-il reward ask")
+            raise ManipError(
+                "the sources have no progress column, which teachers need; use manip-il reward ask"
+            )
         returns = clips.progress[clips.rows].sum(-1)
         difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
         mistaken = rng.random(len(returns)) < self.epsilon
@@ -426,7 +507,11 @@ class Teacher:
 
 
 # name -> the parameter that the number after the name sets, and its default
-TEACHERS = {"perfect": ("epsilon", 0.0), "boltzmann": ("temperature", 1.0), "mistaken": ("epsilon", 0.1)}
+TEACHERS = {
+    "perfect": ("epsilon", 0.0),
+    "boltzmann": ("temperature", 1.0),
+    "mistaken": ("epsilon", 0.1),
+}
 
 
 def answer_pairs(teacher: Teacher, clips: Clips, rng: np.random.Generator) -> Preferences:

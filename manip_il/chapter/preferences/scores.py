@@ -1,9 +1,12 @@
-"""Scores of a dataset's frames and episodes by a reward, and the file of sample weights for LeRobot's RA-BC.
+"""Scores of a dataset's frames and episodes by a reward, and the file of sample weights for
+LeRobot's RA-BC.
 
-RA-BC learns from frames after which progress rises. A frame's own score does not tell whether to learn from it, because
-failing episodes also approach the goal at first. The score at the episode's end does, so the progress written is
+RA-BC learns from frames after which progress rises. A frame's own score does not tell whether to
+learn from it, because failing episodes also approach the goal at first. The score at the episode's
+end does, so the progress written is
 
-    progress_t = t (score of the episode - bar),    bar = upper quartile of the episodes' scores - BELOW
+    progress_t = t (score of the episode - bar)
+    bar = upper quartile of the episodes' scores - BELOW
 
 It rises throughout an episode that ends near the best quarter, and falls throughout the others.
 """
@@ -28,7 +31,8 @@ from manip_il.mdp import F64
 
 FILE_NAME, WEIGHTS_FILE = "scores.json", "rabc.parquet"
 LAST = 1.0  # an episode's score is the mean over its last second [s]
-BEST, BELOW = 0.75, 0.25  # quantile of the episodes' scores, and how far below it the score of a kept episode may be
+# quantile of the episodes' scores, and how far below it the score of a kept episode may be
+BEST, BELOW = 0.75, 0.25
 WORST = 10  # number of episodes listed
 _METADATA = b"reward_model_path"  # the key that LeRobot's own scripts write
 
@@ -52,19 +56,27 @@ class Scores:
 
     @property
     def bar(self) -> float:
-        """Score up to which an episode's frames have no weight: the episodes' upper quartile minus `BELOW`."""
+        """Score up to which an episode's frames have no weight: the episodes' upper quartile
+        minus `BELOW`.
+        """
         return float(np.quantile(self.episodes, BEST)) - BELOW
 
     @property
     def succeeded(self) -> NDArray[np.bool_] | None:
-        """Whether each episode succeeded at some step, (E,); None if the dataset has no success column."""
+        """Whether each episode succeeded at some step, (E,).
+
+        None if the dataset has no success column.
+        """
         if self.data.success is None:
             return None
         return np.logical_or.reduceat(self.data.success, self.data.firsts)
 
     @property
     def auc(self) -> float | None:
-        """Area under the ROC curve for detecting failed episodes by a low score; None if all or none failed."""
+        """Area under the ROC curve for detecting failed episodes by a low score.
+
+        None if all or none failed.
+        """
         return roc_auc(self.episodes, self.succeeded)
 
     def to_json(self) -> dict[str, Any]:
@@ -91,7 +103,9 @@ class Scores:
 
 
 def episode_scores(values: F64, frames: Frames) -> F64:
-    """Return the mean of the frames' values (N,) over the last `LAST` seconds of each episode, (E,)."""
+    """Return the mean of the frames' values (N,) over the last `LAST` seconds of each episode,
+    (E,).
+    """
     last = max(1, round(LAST * frames.spec.fps))
     ends = frames.firsts + frames.lengths
     begins = np.maximum(frames.firsts, ends - last)
@@ -100,7 +114,9 @@ def episode_scores(values: F64, frames: Frames) -> F64:
 
 
 def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
-    """Return P(a failed episode's score is below a successful one's); ties count half (Mann and Whitney 1947).
+    """Return P(a failed episode's score is below a successful one's).
+
+    Ties count half (Mann and Whitney 1947).
 
     scores, succeeded: one per episode, (E,). None if all or none succeeded.
     """
@@ -112,9 +128,11 @@ def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
 
 
 def write_weights(path: Path, scores: Scores) -> None:
-    """Write the columns that LeRobot's RA-BC reads: `index`, `episode_index`, `frame_index`, `progress_sparse`.
+    """Write the columns that LeRobot's RA-BC reads: `index`, `episode_index`, `frame_index`,
+    `progress_sparse`.
 
-    RA-BC ignores the additional column `score`. Raises `ManipError` if the disk is full or read-only.
+    RA-BC ignores the additional column `score`. Raises `ManipError` if the disk is full or
+    read-only.
     """
     data = scores.data
     steps = np.arange(len(scores.frames)) - np.repeat(data.firsts, data.lengths)
@@ -149,9 +167,14 @@ def worst_table(scores: Scores) -> Table:
 
 
 def fact_lines(scores: Scores) -> list[str]:
-    """Return lines that say how many episodes are kept, and how well the score detects failed episodes."""
+    """Return lines that say how many episodes are kept, and how well the score detects failed
+    episodes.
+    """
     kept, count = int((scores.episodes > scores.bar).sum()), len(scores.episodes)
-    lines = [f"{kept:,} of {count:,} episodes score more than {scores.bar:.2f}; frames of the others have weight 0"]
+    lines = [
+        f"{kept:,} of {count:,} episodes score more than {scores.bar:.2f}; frames of the others"
+        " have weight 0"
+    ]
     if scores.auc is not None:
         lines.append(f"area under the ROC curve for detecting failed episodes: {scores.auc:.3f}")
     return lines

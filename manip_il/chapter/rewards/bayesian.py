@@ -1,10 +1,12 @@
 """Bayesian inverse reinforcement learning (Ramachandran & Amir 2007): a posterior of the weights.
 
-Prior: the weights are independent, each exponential with mean `PRIOR` [1/m]. Likelihood: the demonstrator chooses among
-its own path and those that are cheapest for some other weights ("tastes"), in proportion to exp(-w . features). All
-these paths are sensible, and better ones are more likely; the sum over them is exact, and short enough for chains of
-tens of thousands of steps. Tastes are drawn from the prior, then from the posterior, which finds paths of nearly equal
-cost. The posterior is sampled by random-walk Metropolis in log w; its steps are tuned in warm-ups, then fixed.
+Prior: the weights are independent, each exponential with mean `PRIOR` [1/m]. Likelihood: the
+demonstrator chooses among its own path and those that are cheapest for some other weights
+("tastes"), in proportion to exp(-w . features). All these paths are sensible, and better ones are
+more likely; the sum over them is exact, and short enough for chains of tens of thousands of steps.
+Tastes are drawn from the prior, then from the posterior, which finds paths of nearly equal cost.
+The posterior is sampled by random-walk Metropolis in log w; its steps are tuned in warm-ups, then
+fixed.
 """
 
 from __future__ import annotations
@@ -24,15 +26,17 @@ CHAINS = 4  # drawn at once
 _ROUNDS, _MORE = 3, 30  # rounds of drawing tastes from the posterior, and tastes per round
 _DRAWS, _WARM_UP = 10_000, 2_000  # steps of a chain and of each warm-up
 _FIRST, _FITS = 0.3, 2  # initial step size, and number of warm-ups; each one tunes the steps
-_STEP = 2.38  # random walk's step in standard deviations, before division by sqrt(dimension) (Roberts et al. 1997)
+# random walk's step in standard deviations, before division by sqrt(dimension) (Roberts et al.
+# 1997)
+_STEP = 2.38
 
 
 @dataclass(frozen=True)
 class Choices:
     """The paths that the demonstrators chose among, one block of rows per demonstration.
 
-    excess: a path's features minus the demonstration's, (m, K) [m]. A block's first row, zeros, is the demonstration.
-    starts: first row of each block, (D,).
+    excess: a path's features minus the demonstration's, (m, K) [m]. A block's first row, zeros, is
+    the demonstration. starts: first row of each block, (D,).
     """
 
     excess: F64
@@ -40,7 +44,9 @@ class Choices:
 
     @classmethod
     def of(cls, sums: Sequence[F64]) -> Choices:
-        """Return the choices, given feature sums (m, K) for each demonstration, with its own path in the first row."""
+        """Return the choices, given feature sums (m, K) for each demonstration, with its own
+        path in the first row.
+        """
         starts = np.cumsum([0, *map(len, sums[:-1])]).astype(np.int64)
         return cls(np.concatenate([one - one[0] for one in sums]), starts)
 
@@ -61,11 +67,16 @@ class Posterior:
 
     @property
     def mean(self) -> F64:
-        """Posterior mean of the weights, (K,) [1/m]. The cheapest path for the mean has the least expected cost."""
+        """Posterior mean of the weights, (K,) [1/m].
+
+        The cheapest path for the mean has the least expected cost.
+        """
         return self.draws.mean(axis=0)
 
     def ratios(self, base: int, level: float) -> F64:
-        """Return the credible intervals, (K, 2), of each weight's ratio to the weight of feature `base`."""
+        """Return the credible intervals, (K, 2), of each weight's ratio to the weight of feature
+        `base`.
+        """
         ratios = self.draws / self.draws[:, [base]]
         return np.quantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T
 
@@ -74,8 +85,12 @@ class Posterior:
         return self.draws[np.linspace(0, len(self.draws) - 1, count).round().astype(np.int64)]
 
 
-def fit(demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR) -> Posterior:
-    """Return the posterior, given that each demonstration was chosen over the cheapest paths for sampled weights."""
+def fit(
+    demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR
+) -> Posterior:
+    """Return the posterior, given that each demonstration was chosen over the cheapest paths for
+    sampled weights.
+    """
     size = demonstrations[0].problem.features.shape[1]
     sums = rivals(demonstrations, rng.exponential(prior, (TASTES, size)))
     for _ in range(_ROUNDS):
@@ -91,17 +106,23 @@ def draw_posterior(
     count: int = _DRAWS,
     warm_up: int = _WARM_UP,
 ) -> Posterior:
-    """Return draws of the weights given the choices. prior: mean of a weight [1/m]. count: draws per chain."""
+    """Return draws of the weights given the choices. prior: mean of a weight [1/m]. count: draws
+    per chain.
+    """
 
     def density(logs: F64) -> F64:
         weights = np.exp(logs)
-        return choices.log_likelihood(weights) - weights.sum(axis=1) / prior + logs.sum(axis=1)  # d w = w d log w
+        # d w = w d log w
+        return choices.log_likelihood(weights) - weights.sum(axis=1) / prior + logs.sum(axis=1)
 
     size = choices.excess.shape[1]
     start, root = np.log(prior * rng.uniform(0.5, 1.5, (CHAINS, size))), _FIRST * np.eye(size)
     for _ in range(_FITS):
         tried = sample(density, start, root, warm_up, rng)[:, warm_up // 2 :]
-        start, root = tried[:, -1], _STEP / np.sqrt(size) * np.linalg.cholesky(np.cov(tried.reshape(-1, size).T))
+        start, root = (
+            tried[:, -1],
+            _STEP / np.sqrt(size) * np.linalg.cholesky(np.cov(tried.reshape(-1, size).T)),
+        )
     return Posterior(np.exp(sample(density, start, root, count, rng).reshape(-1, size)))
 
 

@@ -1,13 +1,15 @@
 """Maximum entropy inverse reinforcement learning (Ziebart et al. 2008, 2010).
 
-Among all distributions over paths with the demonstrations' expected features, the one with the highest entropy is
-p(path) = exp(-w . features(path)) / Z(w). Its weights maximise the likelihood, which is log-concave; the gradient is
-the difference between expected and demonstrated features. A demonstrator that always takes the cheapest path leaves the
-scale of the weights undetermined, so a normal prior bounds it.
+Among all distributions over paths with the demonstrations' expected features, the one with the
+highest entropy is p(path) = exp(-w . features(path)) / Z(w). Its weights maximise the likelihood,
+which is log-concave; the gradient is the difference between expected and demonstrated features. A
+demonstrator that always takes the cheapest path leaves the scale of the weights undetermined, so a
+normal prior bounds it.
 
-The sum Z over paths of any length solves z = M z + e_goal with M = exp(-cost) for every edge. It is computed by summing
-over longer and longer paths, relative to the cheapest path's cost to avoid underflow. A grid of 10,000 nodes with 26
-neighbours takes 5 ms, a sparse LU decomposition of I - M 170 ms.
+The sum Z over paths of any length solves z = M z + e_goal with M = exp(-cost) for every edge. It is
+computed by summing over longer and longer paths, relative to the cheapest path's cost to avoid
+underflow. A grid of 10,000 nodes with 26 neighbours takes 5 ms, a sparse LU decomposition of I - M
+170 ms.
 """
 
 from collections.abc import Sequence
@@ -24,7 +26,8 @@ from manip_il.tasks.carry.grid import LENGTH, Demonstration, PathProblem, plan, 
 PRIOR = 300.0  # standard deviation of a weight [1/m]
 _MOST_STEPS = 200
 _GRADIENT_TOLERANCE, _LOSS_TOLERANCE = 1e-4, 1e-6  # [m] and relative; L-BFGS-B stops below either
-_LEAST_UNIT, _TINY = 1e-2, 1e-300  # smallest feature unit relative to the largest, and the smallest divisor
+# smallest feature unit relative to the largest, and the smallest divisor
+_LEAST_UNIT, _TINY = 1e-2, 1e-300
 _ABOVE = 1.001  # safety factor on the smallest weight for which the sum over all paths is finite
 _TOLERANCE = 1e-14  # relative; longer paths that add less are ignored
 _MOST_EDGES = 20_000  # edges of the longest path that is summed
@@ -34,8 +37,8 @@ _MOST_EDGES = 20_000  # edges of the longest path that is summed
 class SoftPlan:
     """Distribution of the paths to a goal.
 
-    values: soft cost-to-go -log Z of every node, (S,), infinite if no path leads to the goal. chances: probability of
-    each edge, given its first node, (E,).
+    values: soft cost-to-go -log Z of every node, (S,), infinite if no path leads to the goal.
+    chances: probability of each edge, given its first node, (E,).
     """
 
     problem: PathProblem
@@ -43,7 +46,8 @@ class SoftPlan:
     chances: F64
 
     def visits(self, start: int) -> F64:
-        """Return the expected number of visits to each edge from node `start` on, (E,) (Ziebart et al. 2008, alg. 1).
+        """Return the expected number of visits to each edge from node `start` on, (E,) (Ziebart et
+        al. 2008, alg. 1).
 
         Raises `ManipError` if no path leads to the goal.
         """
@@ -58,7 +62,9 @@ class SoftPlan:
             total += now
             if now.sum() - now[self.problem.goal] <= _TOLERANCE:
                 return total[self.problem.edges[:, 0]] * self.chances
-        raise ManipError(f"paths of more than {_MOST_EDGES} edges are likely; expected higher costs")
+        raise ManipError(
+            f"paths of more than {_MOST_EDGES} edges are likely; expected higher costs"
+        )
 
     def features(self, start: int) -> F64:
         """Return the expected feature sums of a path from node `start`, (K,)."""
@@ -66,16 +72,20 @@ class SoftPlan:
 
 
 def soft_plan(problem: PathProblem, weights: F64) -> SoftPlan:
-    """Return the distribution of paths for weights (K,); larger weights make the cheapest path more likely.
+    """Return the distribution of paths for weights (K,).
 
-    Raises `ManipError` if the sum over all paths is infinite, because their number grows faster than exp(cost) (the
-    spectral radius of the module's M is 1 or more).
+    Larger weights make the cheapest path more likely.
+
+    Raises `ManipError` if the sum over all paths is infinite, because their number grows faster
+    than exp(cost) (the spectral radius of the module's M is 1 or more).
     """
     costs, edges = problem.costs(weights), problem.edges
     hard = plan(problem, weights).costs
     known = np.where(np.isfinite(hard), hard, 0.0)
     leads = np.isfinite(hard)[edges[:, 1]] & (edges[:, 0] != problem.goal)
-    shares = np.where(leads, np.exp(-(costs + known[edges[:, 1]] - known[edges[:, 0]]).clip(min=0.0)), 0.0)
+    shares = np.where(
+        leads, np.exp(-(costs + known[edges[:, 1]] - known[edges[:, 0]]).clip(min=0.0)), 0.0
+    )
     sums = _sum_paths(problem, shares)
     ahead, reached = sums[edges[:, 1]], sums > 0
     chances = shares * ahead / np.where(reached, sums, 1.0)[edges[:, 0]]
@@ -96,12 +106,18 @@ def _sum_paths(problem: PathProblem, shares: F64) -> F64:
             if (found - before <= _TOLERANCE * found).all():
                 return found
     raise ManipError(
-        "the sum over all paths is infinite: their number grows faster than their costs; expected higher weights"
+        "the sum over all paths is infinite: their number grows faster than their costs; expected"
+        " higher weights"
     )
 
 
-def loss_of(demonstrations: Sequence[Demonstration], weights: F64, prior: float = PRIOR) -> tuple[float, F64]:
-    """Return the negative log-posterior per demonstration and its gradient (K,). Raises what `soft_plan` raises."""
+def loss_of(
+    demonstrations: Sequence[Demonstration], weights: F64, prior: float = PRIOR
+) -> tuple[float, F64]:
+    """Return the negative log-posterior per demonstration and its gradient (K,).
+
+    Raises what `soft_plan` raises.
+    """
     count = len(demonstrations)
     loss = 0.5 * float(weights @ weights) / (prior**2 * count)
     gradient = weights / (prior**2 * count)
@@ -113,10 +129,11 @@ def loss_of(demonstrations: Sequence[Demonstration], weights: F64, prior: float 
 
 
 def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
-    """Return the smallest weights (K,) [1/m] for which the sum over all paths is guaranteed to be finite.
+    """Return the smallest weights (K,) [1/m] for which the sum over all paths is guaranteed to be
+    finite.
 
-    The weight of length is just above the log of the largest number of edges from a node, divided by the length of the
-    shortest edge [m]; the other weights are 0.
+    The weight of length is just above the log of the largest number of edges from a node, divided
+    by the length of the shortest edge [m]; the other weights are 0.
     """
     found = np.zeros(demonstrations[0].problem.features.shape[1])
     shortest = min(float(one.problem.features[:, LENGTH].min()) for one in demonstrations)
@@ -126,9 +143,11 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
 
 
 def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> F64:
-    """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B. prior: their standard deviation [1/m].
+    """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B. prior: their standard
+    deviation [1/m].
 
-    The search starts from weights above `least_weights`. It fits some of the demonstrations first, then all of them.
+    The search starts from weights above `least_weights`. It fits some of the demonstrations first,
+    then all of them.
     """
     least = least_weights(demonstrations)
     weights = np.maximum(2 * least, least.max() / 2)
@@ -138,8 +157,13 @@ def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> F64:
 
 
 def _minimise(demonstrations: Sequence[Demonstration], start: F64, least: F64, prior: float) -> F64:
-    """The most likely weights (K,); the optimiser scales each by its feature's initial deviation."""
-    missed = [one.sums - soft_plan(one.problem, start).features(one.start) for one in demonstrations]
+    """The most likely weights (K,).
+
+    The optimiser scales each by its feature's initial deviation.
+    """
+    missed = [
+        one.sums - soft_plan(one.problem, start).features(one.start) for one in demonstrations
+    ]
     units = np.sqrt(np.mean(np.square(missed), axis=0))
     units = (units / max(float(units.max()), _TINY)).clip(min=_LEAST_UNIT)
 
@@ -149,5 +173,7 @@ def _minimise(demonstrations: Sequence[Demonstration], start: F64, least: F64, p
 
     options: Any = {"maxiter": _MOST_STEPS, "gtol": _GRADIENT_TOLERANCE, "ftol": _LOSS_TOLERANCE}
     bounds = [(low, None) for low in least * units]
-    found = minimize(loss, start * units, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    found = minimize(
+        loss, start * units, jac=True, method="L-BFGS-B", bounds=bounds, options=options
+    )
     return np.asarray(found.x / units, np.float64)

@@ -1,7 +1,9 @@
-"""Maximum margin planning (Ratliff et al. 2006): weights for which the demonstrations cost less than all other paths.
+"""Maximum margin planning (Ratliff et al. 2006): weights for which the demonstrations cost less
+than all other paths.
 
-Each demonstration must be cheaper than every other path by a margin that grows with their difference. A subgradient is
-the demonstration's features minus those of the path that is cheapest after the margin is subtracted.
+Each demonstration must be cheaper than every other path by a margin that grows with their
+difference. A subgradient is the demonstration's features minus those of the path that is cheapest
+after the margin is subtracted.
 """
 
 from collections.abc import Sequence
@@ -18,11 +20,14 @@ _RATE = 1.0  # AdaGrad's learning rate, the size of each weight's first step
 _EPSILON = 1e-12
 
 
-def loss_of(demonstration: Demonstration, weights: F64, margin: float = MARGIN) -> tuple[float, F64]:
+def loss_of(
+    demonstration: Demonstration, weights: F64, margin: float = MARGIN
+) -> tuple[float, F64]:
     """Return the margin violation of a demonstration for weights (K,), and a subgradient (K,).
 
-    The margin of a path is `margin` times the length of its edges that end off the demonstration (Ratliff et al. 2006,
-    with the maximum over paths as in their eq. 7). Costs minus margins are positive if length's weight is 1 or more.
+    The margin of a path is `margin` times the length of its edges that end off the demonstration
+    (Ratliff et al. 2006, with the maximum over paths as in their eq. 7). Costs minus margins are
+    positive if length's weight is 1 or more.
     """
     problem = demonstration.problem
     off = np.ones(problem.nodes, bool)
@@ -30,21 +35,28 @@ def loss_of(demonstration: Demonstration, weights: F64, margin: float = MARGIN) 
     loss = margin * problem.features[:, LENGTH] * off[problem.edges[:, 1]]
     planned = plan_edges(problem, problem.costs(weights) - loss)
     _, sums = cheapest_path(problem, planned, demonstration.start)
-    return float(demonstration.sums @ weights - planned.costs[demonstration.start]), demonstration.sums - sums
+    return (
+        float(demonstration.sums @ weights - planned.costs[demonstration.start]),
+        demonstration.sums - sums,
+    )
 
 
 def fit(demonstrations: Sequence[Demonstration], margin: float = MARGIN) -> F64:
-    """Return the weights (K,) of maximum margin planning: the mean over the second half of projected subgradient steps.
+    """Return the weights (K,) of maximum margin planning: the mean over the second half of
+    projected subgradient steps.
 
-    Every weight is at least 0; the weight of length is at least 1, which sets the scale. The step sizes are AdaGrad's.
-    The first steps use some of the demonstrations, the later ones all.
+    Every weight is at least 0; the weight of length is at least 1, which sets the scale. The step
+    sizes are AdaGrad's. The first steps use some of the demonstrations, the later ones all.
     """
     least = np.eye(demonstrations[0].problem.features.shape[1])[LENGTH]
     weights = least
     for some in stages(demonstrations):
         squares, kept = np.zeros_like(least), list[F64]()
         for _ in range(_STEPS):
-            gradient = np.mean([loss_of(one, weights, margin)[1] for one in some], axis=0) + RIDGE * weights
+            gradient = (
+                np.mean([loss_of(one, weights, margin)[1] for one in some], axis=0)
+                + RIDGE * weights
+            )
             squares += gradient**2
             weights = np.maximum(weights - _RATE * gradient / np.sqrt(squares + _EPSILON), least)
             kept.append(weights)

@@ -1,1 +1,3 @@
-"""Proven bounds of imitation learning, beside exactly solved MDPs, linear systems and a robot arm."""
+"""Proven bounds of imitation learning, beside exactly solved MDPs, linear systems and a robot
+arm.
+"""

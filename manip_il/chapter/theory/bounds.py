@@ -1,14 +1,15 @@
 """Losses of cloning and DAgger over the horizon, compared with the bounds of two theorems.
 
-Theorem 8.1: a policy that errs in a share eps of the expert's states loses at most H^2 eps (Ross & Bagnell 2010).
-Theorem 8.2: a policy that errs in a share eps of its own states loses at most u H eps; u is the largest cost of one
-wrong step if the expert then drives (Ross et al. 2011, Theorem 2.2; a bound stated as H eps hides u in its constant).
-The theorems are numbered as in the course, docs/course. Rewards are 0 to 1 per step. Policies are fitted to
-trajectories; in states without data they take the worst action, as the theorems allow.
+Theorem 8.1: a policy that errs in a share eps of the expert's states loses at most H^2 eps (Ross &
+Bagnell 2010). Theorem 8.2: a policy that errs in a share eps of its own states loses at most u H
+eps; u is the largest cost of one wrong step if the expert then drives (Ross et al. 2011, Theorem
+2.2; a bound stated as H eps hides u in its constant). The theorems are numbered as in the course,
+docs/course. Rewards are 0 to 1 per step. Policies are fitted to trajectories; in states without
+data they take the worst action, as the theorems allow.
 
-The processes are small enough to be solved exactly, and differ in what one wrong step costs if the expert then drives.
-A policy is an array (H, S): the probability of a wrong action at each step in each state. Several policies
-are (..., H, S).
+The processes are small enough to be solved exactly, and differ in what one wrong step costs if the
+expert then drives. A policy is an array (H, S): the probability of a wrong action at each step in
+each state. Several policies are (..., H, S).
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,7 +27,8 @@ PLACES = 100  # states that the expert visits
 RIGHT, WRONG = 0, 1  # the expert's action in every state, and the other one
 _BELOW_1 = 1 - 1e-9  # keeps a random number below 1 after rounding
 HORIZONS = (10, 20, 40, 80, 160, 320, 640)
-ERROR = 0.03  # mean error of a policy times the horizon, small enough that the gap does not saturate
+# mean error of a policy times the horizon, small enough that the gap does not saturate
+ERROR = 0.03
 DRAWS = 16  # training sets drawn at each horizon
 ROUNDS, MORE = 5, 20  # DAgger's rounds; each adds 1 / MORE of the initial number of trajectories
 _ROUNDING = 1e-9
@@ -37,9 +39,10 @@ Learner = Literal["cloning", "DAgger"]
 class Process:
     """S states and two actions; the expert always takes `RIGHT`. Rewards are 0 to 1 per step.
 
-    words: what a wrong action does. moves: transition probabilities (action, from, to), (2, S, S), uniform
-    over the successors. rewards: (2, S). start: distribution of the first state, (S,). slopes: powers of
-    the horizon with which gap over error grows according to the theorems, for cloning and for DAgger.
+    words: what a wrong action does. moves: transition probabilities (action, from, to), (2, S, S),
+    uniform over the successors. rewards: (2, S). start: distribution of the first state, (S,).
+    slopes: powers of the horizon with which gap over error grows according to the theorems, for
+    cloning and for DAgger.
     """
 
     name: str
@@ -55,7 +58,9 @@ class Process:
         return len(self.start)
 
     def wrong_costs(self, horizon: int) -> F64:
-        """Return the cost of one wrong action at each step in each state if the expert then drives, (H, S)."""
+        """Return the cost of one wrong action at each step in each state if the expert then
+        drives, (H, S).
+        """
         found, after = np.empty((horizon, self.states)), np.zeros(self.states)
         for t in range(horizon - 1, -1, -1):
             right, wrong = self.rewards + self.moves @ after
@@ -63,12 +68,16 @@ class Process:
         return found
 
     def recoverability(self, horizon: int) -> float:
-        """Return u: the largest cost of one wrong action, over the states that some policy reaches."""
+        """Return u: the largest cost of one wrong action, over the states that some policy
+        reaches.
+        """
         uniform = np.full((horizon, self.states), 0.5)
         return float(self.wrong_costs(horizon)[self.visits(uniform) > 0].max())
 
     def visits(self, policy: F64) -> F64:
-        """Return the distribution of the state at each step, (..., H, S), under policies (..., H, S)."""
+        """Return the distribution of the state at each step, (..., H, S), under policies (...,
+        H, S).
+        """
         found = np.empty(policy.shape)
         now = np.broadcast_to(self.start, (*policy.shape[:-2], self.states))
         for t in range(policy.shape[-2]):
@@ -82,11 +91,15 @@ class Process:
         """States that an action leads to, each as likely as the others, (2, S, K)."""
         size = np.lcm.reduce((self.moves > 0).sum(axis=2).ravel())
         return np.array(
-            [[np.repeat(np.flatnonzero(row), size // np.count_nonzero(row)) for row in rows] for rows in self.moves]
+            [
+                [np.repeat(np.flatnonzero(row), size // np.count_nonzero(row)) for row in rows]
+                for rows in self.moves
+            ]
         )
 
     def seen(self, policy: F64, count: int, rngs: list[np.random.Generator]) -> NDArray[np.bool_]:
-        """Return whether any of `count` trajectories of each policy (B, H, S) visits a state at a step, (B, H, S).
+        """Return whether any of `count` trajectories of each policy (B, H, S) visits a state at a
+        step, (B, H, S).
 
         rngs: one for each policy.
         """
@@ -119,14 +132,21 @@ def _walk(back: bool) -> tuple[F64, F64, F64]:
 
 
 def _ring() -> tuple[F64, F64, F64]:
-    """A ring of `PLACES` states, all visited by the expert: right actions move 1 or 2 forward, wrong ones back."""
+    """A ring of `PLACES` states, all visited by the expert: right actions move 1 or 2 forward,
+    wrong ones back.
+    """
     on = (np.roll(np.eye(PLACES), 1, axis=1) + np.roll(np.eye(PLACES), 2, axis=1)) / 2
     rewards = np.stack([np.ones(PLACES), np.zeros(PLACES)])
     return np.stack([on, on.T]), rewards, np.full(PLACES, 1 / PLACES)
 
 
 PROCESSES = (
-    Process("mended walk", "leads off the path, to which the expert returns in one step", *_walk(True), (2, 1)),
+    Process(
+        "mended walk",
+        "leads off the path, to which the expert returns in one step",
+        *_walk(True),
+        (2, 1),
+    ),
     Process("tightrope", "is a fall without recovery", *_walk(False), (2, 2)),
     Process("visited chain", "leads to another state that the expert visits", *_ring(), (1, 1)),
 )
@@ -134,10 +154,11 @@ PROCESSES = (
 
 @dataclass(frozen=True, eq=False)
 class LossCurve:
-    """Losses of a learner at each of h horizons, for each of D draws of its training data: arrays (h, D).
+    """Losses of a learner at each of h horizons, for each of D draws of its training data: arrays
+    (h, D).
 
-    errors: share of states in which the policy errs; gaps: the expert's return minus the policy's; bounds: upper bounds
-    on the gaps by the learner's theorem.
+    errors: share of states in which the policy errs; gaps: the expert's return minus the policy's;
+    bounds: upper bounds on the gaps by the learner's theorem.
     """
 
     problem: str
@@ -166,10 +187,18 @@ class LossCurve:
         """Return the curve as JSON."""
         losses = {name: getattr(self, name).tolist() for name in ("errors", "gaps", "bounds")}
         found = {"slope": self.slope, "above": self.above}
-        return {"problem": self.problem, "learner": self.learner, "horizons": self.horizons, **losses, **found}
+        return {
+            "problem": self.problem,
+            "learner": self.learner,
+            "horizons": self.horizons,
+            **losses,
+            **found,
+        }
 
 
-def curves(process: Process, horizons: Sequence[int] = HORIZONS, draws: int = DRAWS) -> Iterator[LossCurve]:
+def curves(
+    process: Process, horizons: Sequence[int] = HORIZONS, draws: int = DRAWS
+) -> Iterator[LossCurve]:
     """Yield the loss curves of cloning and of DAgger on one process."""
     found: dict[Learner, list[F64]] = {"cloning": [], "DAgger": []}
     for horizon in horizons:
@@ -180,32 +209,43 @@ def curves(process: Process, horizons: Sequence[int] = HORIZONS, draws: int = DR
 
 
 def losses_of(process: Process, learner: Learner, policies: F64) -> F64:
-    """Return error, gap and bound, (3, B), of each policy (B, H, S), as the learner's theorem defines them.
+    """Return error, gap and bound, (3, B), of each policy (B, H, S), as the learner's theorem
+    defines them.
 
-    The error is measured in the states of the expert (cloning, Theorem 8.1) or the policy (DAgger, Theorem 8.2). The
-    gap is the cost of the policy's wrong actions in the states that it visits (the performance difference lemma).
+    The error is measured in the states of the expert (cloning, Theorem 8.1) or the policy (DAgger,
+    Theorem 8.2). The gap is the cost of the policy's wrong actions in the states that it visits
+    (the performance difference lemma).
     """
     horizon, own = policies.shape[1], process.visits(policies) * policies
     gaps = (own * process.wrong_costs(horizon)).sum(axis=(1, 2))
-    wrong = process.visits(np.zeros((horizon, process.states))) * policies if learner == "cloning" else own
+    wrong = (
+        process.visits(np.zeros((horizon, process.states))) * policies
+        if learner == "cloning"
+        else own
+    )
     factor = horizon if learner == "cloning" else process.recoverability(horizon)
     errors = wrong.sum(axis=(1, 2)) / horizon
     return np.stack([errors, gaps, factor * horizon * errors])
 
 
 def clone(process: Process, seen: NDArray[np.bool_]) -> F64:
-    """Return policies (..., H, S) fitted to labels in the seen states (..., H, S): right in these, wrong elsewhere.
+    """Return policies (..., H, S) fitted to labels in the seen states (..., H, S): right in these,
+    wrong elsewhere.
 
-    In states in which no action is worse than the expert's, such as after a fall, the policies act as the expert.
+    In states in which no action is worse than the expert's, such as after a fall, the policies act
+    as the expert.
     """
     return np.where(seen | (process.wrong_costs(seen.shape[-2]) <= 0), 0.0, 1.0)
 
 
-def dagger(process: Process, seen: NDArray[np.bool_], count: int, rngs: list[np.random.Generator]) -> F64:
-    """Return DAgger's policies (B, H, S): those of the round with the fewest errors in its own states (Definition 8.2).
+def dagger(
+    process: Process, seen: NDArray[np.bool_], count: int, rngs: list[np.random.Generator]
+) -> F64:
+    """Return DAgger's policies (B, H, S): those of the round with the fewest errors in its own
+    states (Definition 8.2).
 
-    seen: whether states (B, H, S) have labels from the expert's own trajectories. count: trajectories per round. rngs:
-    see `Process.seen`.
+    seen: whether states (B, H, S) have labels from the expert's own trajectories. count:
+    trajectories per round. rngs: see `Process.seen`.
     """
     best, least = np.empty(seen.shape), np.full(len(seen), np.inf)
     for round_ in range(ROUNDS + 1):
@@ -219,8 +259,12 @@ def dagger(process: Process, seen: NDArray[np.bool_], count: int, rngs: list[np.
 
 
 def _fitted(process: Process, horizon: int, draws: int) -> dict[Learner, F64]:
-    """Cloning's and DAgger's policies from equally many trajectories, which leave about ERROR / H of states unseen."""
-    rngs = [rng_for(draw, f"trajectories of {horizon} steps, {process.name}") for draw in range(draws)]
+    """Cloning's and DAgger's policies from equally many trajectories, which leave about ERROR /
+    H of states unseen.
+    """
+    rngs = [
+        rng_for(draw, f"trajectories of {horizon} steps, {process.name}") for draw in range(draws)
+    ]
     count = int(np.ceil(PLACES * np.log(horizon / ERROR)))
     first = round(count / (1 + ROUNDS / MORE))
     expert = np.zeros((draws, horizon, process.states))

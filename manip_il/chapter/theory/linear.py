@@ -1,10 +1,12 @@
-"""Cloning with continuous actions, on linear systems that differ in how an uncorrected error develops.
+"""Cloning with continuous actions, on linear systems that differ in how an uncorrected error
+develops.
 
-x' = a x + u + w. The expert u = -k x halves the state in every step. Its demonstrations cover few states off its
-path, so a clone has no feedback there, and an error develops as in the open loop: it decays if the open loop is stable,
-as for an arm whose servos hold joint targets, and grows exponentially otherwise. Simchowitz et al. (2025) prove
-exponential growth for smooth deterministic imitators in general. Noise on the demonstrations, which makes the expert
-show corrections, is DART (Laskey et al. 2017).
+x' = a x + u + w. The expert u = -k x halves the state in every step. Its demonstrations cover few
+states off its path, so a clone has no feedback there, and an error develops as in the open loop: it
+decays if the open loop is stable, as for an arm whose servos hold joint targets, and grows
+exponentially otherwise. Simchowitz et al. (2025) prove exponential growth for smooth deterministic
+imitators in general. Noise on the demonstrations, which makes the expert show corrections, is DART
+(Laskey et al. 2017).
 """
 
 from dataclasses import asdict, dataclass
@@ -29,8 +31,9 @@ _LATE = 10  # the growth is measured over this many final steps
 class Drift:
     """Distance between a clone's and the expert's states. pole: a in the module's x' = a x + u + w.
 
-    noise: standard deviation of the noise on demonstrated actions. error: root mean square error of the clone's
-    actions in the expert's states; apart: root mean square distance from the expert's states after each step, (STEPS,).
+    noise: standard deviation of the noise on demonstrated actions. error: root mean square error of
+    the clone's actions in the expert's states; apart: root mean square distance from the expert's
+    states after each step, (STEPS,).
     """
 
     pole: float
@@ -54,7 +57,9 @@ def drifts() -> list[Drift]:
 
 
 def _drift(pole: float, noise: float) -> Drift:
-    """The drift of a clone with one policy per step, as in the theorems, linear between demonstrated states."""
+    """The drift of a clone with one policy per step, as in the theorems, linear between
+    demonstrated states.
+    """
     rng = rng_for(0, f"linear scalar {pole} {noise}")
     now, shown = rng.uniform(-1, 1, DEMONSTRATIONS), list[F64]()
     for _ in range(STEPS):
@@ -64,7 +69,9 @@ def _drift(pole: float, noise: float) -> Drift:
     expert = learner = rng.uniform(-1, 1, ROLLOUTS)
     for known in shown:
         gust = GUST * rng.standard_normal(expert.shape)
-        on_expert, own = (np.interp(states, known, _expert(pole, known)) for states in (expert, learner))
+        on_expert, own = (
+            np.interp(states, known, _expert(pole, known)) for states in (expert, learner)
+        )
         errors.append(on_expert - _expert(pole, expert))
         learner = pole * learner + own + gust
         expert = pole * expert + _expert(pole, expert) + gust

@@ -25,8 +25,8 @@ _DATA = "#b9bfc6"
 class Theory:
     """All results.
 
-    curves: of cloning and of DAgger on each of `PROCESSES`, in turn. shift: a run's distribution shift, if a run was
-    given.
+    curves: of cloning and of DAgger on each of `PROCESSES`, in turn. shift: a run's distribution
+    shift, if a run was given.
     """
 
     curves: tuple[LossCurve, ...]
@@ -49,14 +49,27 @@ class Theory:
 
 
 def slope_table(theory: Theory) -> Table:
-    """Return a table of the log-log slopes of gap over error against the horizon, one row per process."""
+    """Return a table of the log-log slopes of gap over error against the horizon, one row per
+    process.
+    """
     rows = []
-    for process, cloned, improved in zip(PROCESSES, theory.curves[::2], theory.curves[1::2], strict=True):
+    for process, cloned, improved in zip(
+        PROCESSES, theory.curves[::2], theory.curves[1::2], strict=True
+    ):
         last = cloned.horizons[-1]
         u = f"{process.recoverability(last):g} at H = {last}"
-        rows.append((process.name, u, *map(str, process.slopes), f"{cloned.slope:.2f}", f"{improved.slope:.2f}"))
+        rows.append(
+            (
+                process.name,
+                u,
+                *map(str, process.slopes),
+                f"{cloned.slope:.2f}",
+                f"{improved.slope:.2f}",
+            )
+        )
     return Table(
-        ("process", "recoverability u", "cloning, theorem", "DAgger, theorem", "cloning", "DAgger"), tuple(rows)
+        ("process", "recoverability u", "cloning, theorem", "DAgger, theorem", "cloning", "DAgger"),
+        tuple(rows),
     )
 
 
@@ -69,11 +82,16 @@ def theory_report(theory: Theory) -> Report:
     policies = sum(curve.gaps.size for curve in theory.curves)
     return Report(
         title="Theorems on imitation, compared with measurements",
-        verdict="If the expert can recover from a mistake, cloning's gap per error grows as the horizon to the power "
-        f"of {walk:.1f} and DAgger's to the power of {improved:.1f}; on a tightrope both powers are {rope:.1f}.",
+        verdict=(
+            "If the expert can recover from a mistake, cloning's gap per error grows as the"
+            f" horizon to the power of {walk:.1f} and DAgger's to the power of {improved:.1f}; on a"
+            f" tightrope both powers are {rope:.1f}."
+        ),
         facts=(
-            f"{policies:,} policies on three processes, all values by dynamic programming: "
-            f"{theory.above or 'none'} above its bound.",
+            (
+                f"{policies:,} policies on three processes, all values by dynamic programming: "
+                f"{theory.above or 'none'} above its bound."
+            ),
         ),
         sections=tuple(sections),
     )
@@ -83,55 +101,86 @@ def _theorems(theory: Theory) -> Section:
     return Section(
         "Cloning and DAgger over the horizon",
         lead=(
-            "Three finite processes, solved exactly, on which the expert never errs. A wrong action "
+            "Three finite processes, solved exactly, on which the expert never errs. A wrong"
+            " action "
             + "; ".join(f"{process.words} ({process.name})" for process in PROCESSES)
             + ".",
         ),
         formulas=(
-            "Theorem 8.1, cloning:  J(π*) - J(π) ≤ H² ε,  ε: share of the expert's states in which π errs",
-            "Theorem 8.2, DAgger:  J(π*) - J(π) ≤ u H ε,  ε: share of π's own states in which it errs",
+            (
+                "Theorem 8.1, cloning:  J(π*) - J(π) ≤ H² ε,  ε: share of the expert's states in"
+                " which π errs"
+            ),
+            (
+                "Theorem 8.2, DAgger:  J(π*) - J(π) ≤ u H ε,  ε: share of π's own states in which"
+                " it errs"
+            ),
         ),
         figures=(_theorem_figure(theory.curves),),
         tables=(slope_table(theory),),
         notes=(
-            "Log-log slopes of gap over error. u is the largest "
-            "cost of one wrong step if the expert then drives. Where the bound is stated as H ε, its constant includes "
-            "u: if no recovery is possible, as on the tightrope, u is H, and DAgger loses as much as cloning (Ross et "
-            "al. 2011; Rajaraman et al. 2020).",
-            f"Points: {DRAWS} fits per horizon, to trajectories that leave about {ERROR:g}/H of the states unseen; in "
-            "those, a fit takes the worst action.",
+            (
+                "Log-log slopes of gap over error. u is the largest cost of one wrong step if the"
+                " expert then drives. Where the bound is stated as H ε, its constant includes u: if"
+                " no recovery is possible, as on the tightrope, u is H, and DAgger loses as much as"
+                " cloning (Ross et al. 2011; Rajaraman et al. 2020)."
+            ),
+            (
+                f"Points: {DRAWS} fits per horizon, to trajectories that leave about {ERROR:g}/H of"
+                " the states unseen; in those, a fit takes the worst action."
+            ),
         ),
     )
 
 
 def _theorem_figure(curves: Sequence[LossCurve]) -> Figure:
-    """Gap over error against the horizon: one panel per process, with both learners and their bounds."""
+    """Gap over error against the horizon: one panel per process, with both learners and their
+    bounds.
+    """
     with drawing(len(PROCESSES), size=(3.2, 3.0)) as (drawn, axes):
         for axis, process, *own in zip(axes[0], PROCESSES, curves[::2], curves[1::2], strict=True):
             for curve in own:
                 colour, marker = _LOOKS[curve.learner]
-                axis.plot(curve.horizons, curve.ratios, marker, color=colour, ms=4.5, label=curve.learner)
+                axis.plot(
+                    curve.horizons, curve.ratios, marker, color=colour, ms=4.5, label=curve.learner
+                )
                 bounds = curve.bounds.mean(axis=1) / curve.errors.mean(axis=1)
-                axis.plot(curve.horizons, bounds, ":", color=colour, lw=1.2, label=f"bound, {curve.learner}")
+                axis.plot(
+                    curve.horizons,
+                    bounds,
+                    ":",
+                    color=colour,
+                    lw=1.2,
+                    label=f"bound, {curve.learner}",
+                )
             axis.set(xscale="log", yscale="log", xlabel="horizon H", title=process.name)
         axes[0, 0].set_ylabel("gap / ε")
         drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        return to_figure(drawn, "Gap over error against the horizon, three processes, cloning and DAgger, with bounds")
+        return to_figure(
+            drawn,
+            "Gap over error against the horizon, three processes, cloning and DAgger, with bounds",
+        )
 
 
 def _linear(theory: Theory) -> Section:
     return Section(
         "Continuous control: how an error develops",
         lead=(
-            f"x' = a x + u + w, with disturbances w of {GUST:g}; the expert halves the state in every step. Its "
-            "demonstrations cover few states beside its path, so a clone does not correct errors there: they decay if "
-            "the open loop is stable, as with servos that hold joint targets, and otherwise grow by the open loop's "
-            "factor per step, however small the clone's error in the expert's states (in the legend).",
+            (
+                f"x' = a x + u + w, with disturbances w of {GUST:g}; the expert halves the state in"
+                " every step. Its demonstrations cover few states beside its path, so a clone does"
+                " not correct errors there: they decay if the open loop is stable, as with servos"
+                " that hold joint targets, and otherwise grow by the open loop's factor per step,"
+                " however small the clone's error in the expert's states (in the legend)."
+            ),
         ),
         figures=(_linear_figure(theory.drifts),),
         notes=(
-            "Noise on the demonstrations (DART, dashed) makes the expert show corrections, and the clone learns them. "
-            "The exponential growth is proved for smooth deterministic imitators (Simchowitz et al. 2025).",
+            (
+                "Noise on the demonstrations (DART, dashed) makes the expert show corrections, and"
+                " the clone learns them. The exponential growth is proved for smooth deterministic"
+                " imitators (Simchowitz et al. 2025)."
+            ),
         ),
     )
 
@@ -142,13 +191,24 @@ def _linear_figure(drifts: Sequence[Drift]) -> Figure:
         [[axis]] = axes
         for drift in drifts:
             name, noise = OPEN_LOOPS[drift.pole], ", noisy" if drift.noise else ""
-            label = f"{name}, a = {drift.pole:g}{noise}: error {drift.error:.1e}, growth {drift.growth:.2f}"
-            look = {"color": COLOURS[list(OPEN_LOOPS).index(drift.pole)], "ls": "--" if noise else "-"}
-            axis.plot(range(1, len(drift.apart) + 1), np.maximum(drift.apart, _LEAST), label=label, **look)
+            label = (
+                f"{name}, a = {drift.pole:g}{noise}: error {drift.error:.1e}, growth"
+                f" {drift.growth:.2f}"
+            )
+            look = {
+                "color": COLOURS[list(OPEN_LOOPS).index(drift.pole)],
+                "ls": "--" if noise else "-",
+            }
+            axis.plot(
+                range(1, len(drift.apart) + 1), np.maximum(drift.apart, _LEAST), label=label, **look
+            )
         axis.axhline(GUST, color=SOFT, lw=0.8, ls=":")
         axis.set(yscale="log", xlabel="step", ylabel="distance from the expert", ylim=(_LEAST, 100))
         drawn.legend(*axis.get_legend_handles_labels(), loc="outside lower center")
-        return to_figure(drawn, "Distance of clones from the expert over the steps, on stable and unstable systems")
+        return to_figure(
+            drawn,
+            "Distance of clones from the expert over the steps, on stable and unstable systems",
+        )
 
 
 def _arm(shift: Shift) -> list[Section]:
@@ -172,11 +232,17 @@ def _arm(shift: Shift) -> list[Section]:
             f"The arm: {shift.env.robot} {shift.env.task}",
             tables=(Table(columns, tuple(rows)),),
             notes=(
-                f"An action is wrong if a joint is off the expert's label by more than {WRONG:g} of its largest step.",
-                f"Costs are control steps until success, or {shift.env.horizon} without success; the expert takes "
-                f"{shift.expert_cost:.1f}. u is the largest observed cost of one wrong action for the expert, "
-                f"{shift.u} steps; the true u may be larger. A bound above the horizon says nothing about this policy: "
-                "the theorem counts every wrong action as the worst one.",
+                (
+                    "An action is wrong if a joint is off the expert's label by more than"
+                    f" {WRONG:g} of its largest step."
+                ),
+                (
+                    f"Costs are control steps until success, or {shift.env.horizon} without"
+                    f" success; the expert takes {shift.expert_cost:.1f}. u is the largest observed"
+                    f" cost of one wrong action for the expert, {shift.u} steps; the true u may be"
+                    " larger. A bound above the horizon says nothing about this policy: the"
+                    " theorem counts every wrong action as the worst one."
+                ),
             ),
         ),
         Section(
@@ -190,12 +256,20 @@ def _arm(shift: Shift) -> list[Section]:
 def _clouds_figure(rounds: Sequence[RoundShift]) -> Figure:
     """Positions of the hand in the data and in the policy's rollouts, seen from above, by round."""
     shown = [*rounds[:3], *rounds[3:][-1:]]  # early rounds differ most
-    with drawing(len(shown), size=(9.0 / len(shown), 3.0), sharex="row", sharey="row") as (drawn, axes):
+    with drawing(len(shown), size=(9.0 / len(shown), 3.0), sharex="row", sharey="row") as (
+        drawn,
+        axes,
+    ):
         for axis, one in zip(axes[0], shown, strict=True):
-            for places, colour in ((one.data, _DATA), (one.hand, CLONING if one.round == 0 else DAGGER)):
+            for places, colour in (
+                (one.data, _DATA),
+                (one.hand, CLONING if one.round == 0 else DAGGER),
+            ):
                 x, y, _ = places[:: max(1, len(places) // _POINTS)].T
                 axis.scatter(y, x, s=2.5, color=colour, alpha=0.55, lw=0, rasterized=True)
             axis.set(title=one.name, xlabel="y [m]", ylabel="x [m]")
             axis.set_aspect("equal", adjustable="box")
         axes[0, 0].invert_xaxis()
-        return to_figure(drawn, "Positions of the hand in the data and in the policy's rollouts, by round")
+        return to_figure(
+            drawn, "Positions of the hand in the data and in the policy's rollouts, by round"
+        )

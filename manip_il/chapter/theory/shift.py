@@ -1,8 +1,8 @@
 """Distribution shift on an arm, measured for every round of a DAgger run.
 
-For each round's policy: how often it errs in the expert's states and in its own, where its hand and that of its
-training data were, and how much more it costs than the expert, compared with Theorem 8.2's bound.
-Costs are control steps until the task is solved, or the horizon if it is not.
+For each round's policy: how often it errs in the expert's states and in its own, where its hand and
+that of its training data were, and how much more it costs than the expert, compared with Theorem
+8.2's bound. Costs are control steps until the task is solved, or the horizon if it is not.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,23 +29,33 @@ from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import described_env, env_spec
 
 EPISODES = 50  # episodes of the expert and of each round's policy
-WRONG = 0.25  # an action is wrong if any joint is off the label by more than this share of its largest step
+# an action is wrong if any joint is off the label by more than this share of its largest step
+WRONG = 0.25
 _HAND = ("ee.x", "ee.y", "ee.z")
-_COLUMNS = (schema.STATE, schema.ENVIRONMENT_STATE, schema.ACTION, schema.EXECUTED_ACTION, schema.LABEL_VALID)
+_COLUMNS = (
+    schema.STATE,
+    schema.ENVIRONMENT_STATE,
+    schema.ACTION,
+    schema.EXECUTED_ACTION,
+    schema.LABEL_VALID,
+)
 Columns = dict[str, NDArray[Any]]
 OnEpisode = Callable[[Episode], None]
 
 
-RoundData = tuple[int, Path, tuple[Path, ...]]  # number, `pretrained_model` folder, training datasets
+# number, `pretrained_model` folder, training datasets
+RoundData = tuple[int, Path, tuple[Path, ...]]
 
 
 @dataclass(frozen=True)
 class RoundShift:
-    """One round's policy. on_expert, on_own: how often it is wrong, as a share of the expert's and of its own states.
+    """One round's policy. on_expert, on_own: how often it is wrong, as a share of the expert's and
+    of its own states.
 
-    on_expert: None for a policy on pictures. mistakes: mean number of wrong actions per episode. cost: mean
-    cost; gap: its excess over the expert's cost [control steps]; bound: Theorem 8.2's bound on the gap, u times
-    `mistakes`. data, hand: positions of the hand in the training data and in the policy's rollouts, (N, 3) [m].
+    on_expert: None for a policy on pictures. mistakes: mean number of wrong actions per episode.
+    cost: mean cost; gap: its excess over the expert's cost [control steps]; bound: Theorem 8.2's
+    bound on the gap, u times `mistakes`. data, hand: positions of the hand in the training data and
+    in the policy's rollouts, (N, 3) [m].
     """
 
     round: int
@@ -73,7 +83,10 @@ class RoundShift:
 
 @dataclass(frozen=True)
 class Shift:
-    """A run's rounds. expert_cost: the expert's mean cost; u: largest cost seen of one wrong action [control steps]."""
+    """A run's rounds. expert_cost: the expert's mean cost.
+
+    u: largest cost seen of one wrong action [control steps].
+    """
 
     env: EnvConfig
     expert_cost: float
@@ -93,7 +106,10 @@ class Shift:
 
 
 def find_rounds(run: Path) -> list[RoundData]:
-    """Return the rounds of a run that have a policy and training data. Raises `ManipError` if there is none."""
+    """Return the rounds of a run that have a policy and training data.
+
+    Raises `ManipError` if there is none.
+    """
     found, datasets = list[RoundData](), list[Path]()
     for folder in sorted(run.glob("round_[0-9][0-9][0-9]")):
         if (folder / "dataset" / "meta" / "info.json").is_file():
@@ -102,7 +118,9 @@ def find_rounds(run: Path) -> list[RoundData]:
         if (policy / "config.json").is_file() and datasets:
             found.append((int(folder.name[-3:]), policy, tuple(datasets)))
     if not found:
-        raise ManipError(f"{run} has no round with a policy; expected the folder of a run of manip-il dagger")
+        raise ManipError(
+            f"{run} has no round with a policy; expected the folder of a run of manip-il dagger"
+        )
     return found
 
 
@@ -115,9 +133,11 @@ def measure_shift(
     on_episode: OnEpisode = lambda _: None,
     conditions: tuple[Condition, ...] = (),
 ) -> Shift:
-    """Run the expert and every round's policy on the same seeds, and query the expert in every state.
+    """Run the expert and every round's policy on the same seeds, and query the expert in every
+    state.
 
-    conditions: the run's variations of the world. u: the expert's recoverability on `env`, see `certify`.
+    conditions: the run's variations of the world. u: the expert's recoverability on `env`, see
+    `certify`.
     """
     seeds, scale = stream_seeds("theory", episodes), described_env(env).actions.scale
     spec, found = env_spec(env), list[RoundShift]()
@@ -125,11 +145,17 @@ def measure_shift(
     plain = RolloutJob(env, hold=0, conditions=conditions)
     expert, expert_cost, _ = _run(engine, plain, seeds, on_episode)
     for number, path, datasets in rounds:
-        own, cost, success = _run(engine, replace(plain, driver=PolicyDriver.of(path)), seeds, on_episode)
+        own, cost, success = _run(
+            engine, replace(plain, driver=PolicyDriver.of(path)), seeds, on_episode
+        )
         policy = LearnedPolicy.load(path)
         data = joined_columns(datasets, [schema.ENVIRONMENT_STATE])[schema.ENVIRONMENT_STATE]
         wrong = _is_wrong(own[schema.EXECUTED_ACTION], own, scale)
-        on_expert = None if policy.cameras else float(_is_wrong(_actions_on(policy, expert), expert, scale).mean())
+        on_expert = (
+            None
+            if policy.cameras
+            else float(_is_wrong(_actions_on(policy, expert), expert, scale).mean())
+        )
         mistakes = float(wrong.sum() / episodes)
         found.append(
             RoundShift(
@@ -151,7 +177,9 @@ def measure_shift(
 def _run(
     engine: Engine, job: RolloutJob, seeds: Sequence[int], on_episode: OnEpisode
 ) -> tuple[Columns, float, Proportion]:
-    """Columns of all episodes in the order of their seeds, their mean cost, and their success rate."""
+    """Columns of all episodes in the order of their seeds, their mean cost, and their success
+    rate.
+    """
     found = list[Episode]()
     for episode in engine.run(job, seeds):
         found.append(episode.without_pictures())
@@ -159,7 +187,9 @@ def _run(
     found.sort(key=lambda episode: episode.seed)
     table = {key: np.concatenate([one.columns[key] for one in found]) for key in _COLUMNS}
     table[EPISODE_INDEX] = np.repeat(np.arange(len(found)), [len(one) for one in found])
-    cost = float(np.mean([len(episode) if episode.success else job.env.horizon for episode in found]))
+    cost = float(
+        np.mean([len(episode) if episode.success else job.env.horizon for episode in found])
+    )
     return table, cost, Proportion.of([episode.success for episode in found])
 
 

@@ -1,1 +1,4 @@
-"""What the commands do. `manip_il.cli` declares their options, without these imports, and calls `run_COMMAND`."""
+"""What the commands do.
+
+`manip_il.cli` declares their options, without these imports, and calls `run_COMMAND`.
+"""

@@ -42,7 +42,9 @@ def run_pairs(options: PairsOptions) -> None:
     options.check()
     reward = LearnedReward.load(find_policy(options.reward)) if options.reward else None
     rng = rng_for(stream_base("training", options.seed), "pairs")
-    clips = choose_pairs(find_datasets(options.sources), options.clip, options.count, options.seed, rng, reward)
+    clips = choose_pairs(
+        find_datasets(options.sources), options.clip, options.count, options.seed, rng, reward
+    )
     write_json(options.output, clips.pairs.to_json())
     say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {options.output}")
 
@@ -95,7 +97,13 @@ def run_irl(options: IrlOptions) -> None:
     found = inverse.Inverse(str(options.dataset), tuple(carried), learnt)
     with options.open() as folder:
         page = inverse.inverse_report(found)
-        publish(folder / inverse.FILE_NAME, found.to_json(), [inverse.weight_table(found)], page=page, options=options)
+        publish(
+            folder / inverse.FILE_NAME,
+            found.to_json(),
+            [inverse.weight_table(found)],
+            page=page,
+            options=options,
+        )
 
 
 PROGRESS = "progress"  # value of --reward: score by true progress

@@ -1,4 +1,5 @@
-"""Run `manip-il data render`, `redraw`, `relabel`, `build`, `merge`: make a dataset from existing ones.
+"""Run `manip-il data render`, `redraw`, `relabel`, `build`, `merge`: make a dataset from existing
+ones.
 
 Run `manip-il data check`, `repair`: find errors in a dataset, and repair them.
 """
@@ -48,7 +49,10 @@ def run_build(options: BuildOptions) -> None:
     require_writable(options.dataset, DATASET, options.overwrite, [options.journals])
     with exclusive(options.dataset):
         info, failed = build(options.journals, options.dataset, replace=options.overwrite)
-    say(f"built {info.episodes:,} episodes, {info.frames:,} frames; failed episodes left out: {failed}")
+    say(
+        f"built {info.episodes:,} episodes, {info.frames:,} frames; failed episodes left out:"
+        f" {failed}"
+    )
     say(f"dataset: {options.dataset}")
 
 
@@ -67,7 +71,8 @@ def _open(
 ) -> Generator[tuple[EditSource, EditTarget]]:
     """Yield the dataset to read and the new dataset's locked folder, and show progress.
 
-    root: the dataset, by default `source`. pieces: total of the progress bar, by default the number of episodes.
+    root: the dataset, by default `source`. pieces: total of the progress bar, by default the number
+    of episodes.
     """
     root = root or options.source
     folder = options.target or root.with_name(f"{root.absolute().name}_{what}")
@@ -75,7 +80,10 @@ def _open(
     source = open_source(root, options.robot, options.task, options.object)
     warn(*source.warnings)
     with exclusive(folder), progress(pieces or source.dataset.info.episodes, str(folder)) as bar:
-        yield source, EditTarget(folder, options.workers or default_workers(), options.overwrite, bar.step)
+        yield (
+            source,
+            EditTarget(folder, options.workers or default_workers(), options.overwrite, bar.step),
+        )
     say(f"dataset: {folder}")
 
 
@@ -90,24 +98,39 @@ def run_relabel(options: RelabelOptions) -> None:
     """Label every state; TARGET appears when it is complete."""
     with _open(options, "relabelled") as (source, target):
         changed, info = relabel_dataset(source, target), source.dataset.info
-        say(f"relabelled {info.episodes:,} episodes, {info.frames:,} frames: {changed:,} labels differ")
+        say(
+            f"relabelled {info.episodes:,} episodes, {info.frames:,} frames: {changed:,} labels"
+            " differ"
+        )
 
 
 def run_redraw(options: RedrawOptions) -> None:
     """Draw all scenes; TARGET appears when it is complete."""
-    root = options.source / _RUN if (options.source / _RUN / "meta" / "info.json").is_file() else options.source
+    root = (
+        options.source / _RUN
+        if (options.source / _RUN / "meta" / "info.json").is_file()
+        else options.source
+    )
     with _open(options, "redrawn", root, -(-options.frames // CHUNK)) as (source, target):
         conditions = varied(options.vary, source.env, sees=True)
         cameras = options.camera_config(source.env)
         cameras = cameras if options.pictures else None
-        scenes = Scenes(cameras, options.frames, options.seed, options.scenes, conditions, options.branch_steps)
+        scenes = Scenes(
+            cameras, options.frames, options.seed, options.scenes, conditions, options.branch_steps
+        )
         info = redraw_dataset(source, scenes, target)
         left = options.frames - info.episodes
-        say(f"redrew {info.episodes:,} scenes, {info.frames:,} frames; {left:,} left out, without a valid label")
+        say(
+            f"redrew {info.episodes:,} scenes, {info.frames:,} frames; {left:,} left out, without a"
+            " valid label"
+        )
 
 
 def run_check(options: CheckOptions) -> None:
-    """Check the dataset and print every finding and the verdict; raises `ManipError` if there are errors."""
+    """Check the dataset and print every finding and the verdict.
+
+    Raises `ManipError` if there are errors.
+    """
     _conclude(options, _examine(options), f"try manip-il data repair {options.dataset}")
 
 
@@ -121,9 +144,14 @@ def _examine(options: CheckOptions) -> list[Finding]:
 def _conclude(options: CheckOptions, findings: list[Finding], remedy: str) -> None:
     errors = sum(finding.is_error for finding in findings)
     if errors:
-        raise ManipError(f"{options.dataset}: errors: {errors}, warnings: {len(findings) - errors}; {remedy}")
+        raise ManipError(
+            f"{options.dataset}: errors: {errors}, warnings: {len(findings) - errors}; {remedy}"
+        )
     info = Dataset.open(options.dataset).info
-    say(f"{options.dataset}: {info.episodes:,} episodes, {info.frames:,} frames: whole; warnings: {len(findings)}")
+    say(
+        f"{options.dataset}: {info.episodes:,} episodes, {info.frames:,} frames: whole; warnings:"
+        f" {len(findings)}"
+    )
 
 
 def run_repair(options: RepairOptions) -> None:
@@ -131,15 +159,25 @@ def run_repair(options: RepairOptions) -> None:
     if findings := _examine(options):
         say(*(f"repair   {line}" for line in repair(options.dataset.absolute(), findings)))
         findings = _examine(options)
-    _conclude(options, findings, "these cannot be repaired from what is here: pull or record it again")
+    _conclude(
+        options, findings, "these cannot be repaired from what is here: pull or record it again"
+    )
 
 
 def check_robot(dataset: Dataset) -> Iterator[Finding]:
-    """Compare a dataset's joints, observations and model with those of its robot and task in this version."""
+    """Compare a dataset's joints, observations and model with those of its robot and task in
+    this version.
+    """
     if dataset.own is None:
         return
     try:
         for text in differences(dataset):
-            yield warning(OURS, text, f"for labels of the current expert: manip-il data relabel {dataset.root}")
+            yield warning(
+                OURS,
+                text,
+                f"for labels of the current expert: manip-il data relabel {dataset.root}",
+            )
     except ManipError as error:
-        yield Finding(OURS, str(error), "use the version of this program that recorded it, or record again")
+        yield Finding(
+            OURS, str(error), "use the version of this program that recorded it, or record again"
+        )

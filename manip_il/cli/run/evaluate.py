@@ -80,11 +80,16 @@ def _merge(options: EvalOptions) -> None:
         warn(*compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
     with options.open() as folder:
         tables = [success_table(condition_sides(merged))]
-        publish(folder / FILE_NAME, merged.to_json(), tables, page=eval_report(merged), options=options)
+        publish(
+            folder / FILE_NAME, merged.to_json(), tables, page=eval_report(merged), options=options
+        )
 
 
 def _replay(options: EvalOptions, file: Path, seed: int) -> None:
-    """Replay one episode with the same policy, seed and conditions; `ManipError` if its outcome differs."""
+    """Replay one episode with the same policy, seed and conditions.
+
+    `ManipError` if its outcome differs.
+    """
     if options.video is not None:
         OutputFile(output=options.video, overwrite=options.overwrite).check()
     own = {name: options.env[name] for name in ("robot", "task", "object")}
@@ -92,20 +97,28 @@ def _replay(options: EvalOptions, file: Path, seed: int) -> None:
     before = again.before
     ended = "success" if before.success else f"failure in phase {before.phase_at_end}"
     say(f"seed {seed}, {before.condition or 'nominal'}: {ended}")
-    say(*(f"  {name}: {json.dumps(value)}" for name, value in before.detail.get("drawn", {}).items()))
+    say(
+        *(
+            f"  {name}: {json.dumps(value)}"
+            for name, value in before.detail.get("drawn", {}).items()
+        )
+    )
     if options.video is not None:
         write_file(options.video, film_episode(again.job.env, again.episode).mp4)
         say(f"video: {options.video}")
     if again.differences:
         raise ManipError(
-            f"the episode of seed {seed} differs from {file}: {'; '.join(again.differences)}; compare success rates, "
-            "not single episodes, across machines and versions"
+            f"the episode of seed {seed} differs from {file}: {'; '.join(again.differences)};"
+            " compare success rates, not single episodes, across machines and versions"
         )
     say(f"the same as in {file}")
 
 
 def machine() -> str:
-    """Return the OpenGL renderer and the number of cores. Raises if an environment cannot start or render here."""
+    """Return the OpenGL renderer and the number of cores.
+
+    Raises if an environment cannot start or render here.
+    """
     tempfile.TemporaryFile().close()  # workers need a folder for temporary files
     env = make_env()
     env.start(0)

@@ -15,11 +15,15 @@ def run_export(options: ExportOptions) -> None:
     options.check()
     path = find_policy(options.policy)
     if (kind := read_config(path)["type"]) not in EXPORTABLE:
-        raise ManipError(f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported")
+        raise ManipError(
+            f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported"
+        )
     try:
         content, difference = export_onnx(path)
     except ImportError as error:
-        raise ManipError(f"an ONNX file needs {error.name}: pip install 'manip_il[export]'") from error
+        raise ManipError(
+            f"an ONNX file needs {error.name}: pip install 'manip_il[export]'"
+        ) from error
     write_file(options.output, content)
     say(f"largest difference from {path} over random observations: {difference:.1e}")
     say(f"exported: {options.output} ({len(content):,} bytes)")

@@ -36,7 +36,15 @@ from manip_il.evaluation.measuring import measure_sides, open_driver
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.rounds import METRICS_FILE, Rule
 from manip_il.evaluation.runner import episode_hold
-from manip_il.evaluation.side import Member, Side, read_member, read_side, require_pair, require_same_env, select_rounds
+from manip_il.evaluation.side import (
+    Member,
+    Side,
+    read_member,
+    read_side,
+    require_pair,
+    require_same_env,
+    select_rounds,
+)
 from manip_il.evaluation.suites import varied
 from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
 from manip_il.learn.checkpoint import Checkpoint, with_folder
@@ -48,7 +56,11 @@ def run_dagger(options: DaggerOptions) -> None:
     """Run all rounds, or continue them."""
     config, folder = dagger_config(options), options.output_dir
     kept = f"every finished episode and round, in {folder}"
-    with options.lock() as prepare, Stages(kept, prepare) as stages, options.open_engine() as engine:
+    with (
+        options.lock() as prepare,
+        Stages(kept, prepare) as stages,
+        options.open_engine() as engine,
+    ):
         results = dagger(folder, config, workers=engine, progress=stages)
         kind = ALGORITHMS[config.method]
         page = validation_report(
@@ -82,7 +94,9 @@ def dagger_config(options: DaggerOptions) -> RunConfig:
         env=env,
         method=options.method,
         conditions=varied(options.vary, env, sees=cameras is not None),
-        fit=FitConfig(**dict(options.fit, policy=policy, observation=observation, trust=options.trust)),
+        fit=FitConfig(
+            **dict(options.fit, policy=policy, observation=observation, trust=options.trust)
+        ),
         cameras=cameras,
         datasets=tuple(options.dataset.root),
         start=start and start.path,
@@ -94,7 +108,8 @@ def dagger_config(options: DaggerOptions) -> RunConfig:
 def round_policy(settings: Open) -> tuple[Open, Checkpoint | None]:
     """Return the policy options for fits, and the checkpoint to start from, if any.
 
-    For an mlp, the options stored in the checkpoint replace the key `path`: they are needed before LeRobot is imported.
+    For an mlp, the options stored in the checkpoint replace the key `path`: they are needed before
+    LeRobot is imported.
     """
     if "path" not in settings:
         return settings, None
@@ -102,7 +117,9 @@ def round_policy(settings: Open) -> tuple[Open, Checkpoint | None]:
     if (options := start.mlp_options) is None:
         return settings, start
     if "type" in settings:
-        raise UsageError("give one of --policy.path=DIR and --policy.type=...: the checkpoint sets the type")
+        raise UsageError(
+            "give one of --policy.path=DIR and --policy.type=...: the checkpoint sets the type"
+        )
     return options | {name: value for name, value in settings.items() if name != "path"}, start
 
 
@@ -111,7 +128,9 @@ ENOUGH = 1.25  # demonstrations to record, relative to the number that should gi
 
 def run_demo(options: DemoOptions) -> None:
     """Run the missing steps, print the table, write the report."""
-    config = dagger_config(DaggerOptions(env=options.env, settings=options.settings, fit=options.fit))
+    config = dagger_config(
+        DaggerOptions(env=options.env, settings=options.settings, fit=options.fit)
+    )
     kept = f"every finished episode, round and evaluation, in {options.output_dir}"
     with options.open() as folder, Stages(kept) as stages, options.open_engine() as engine:
         sides = _measure(options, config, folder, engine, stages)
@@ -122,7 +141,9 @@ def run_demo(options: DemoOptions) -> None:
         for prefix, tested in (("", sides), ("Disturbed: ", disturbed))
         for place in (2, 1)  # cloning from as many labels, then round 0
     )
-    facts.append(f"{config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.")
+    facts.append(
+        f"{config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was."
+    )
     page = run_report(
         sides,
         [Side("DAgger", (read_member(folder / "dagger"),))],
@@ -138,11 +159,20 @@ def run_demo(options: DemoOptions) -> None:
     success_table(sides).print()
     say(verdict, *facts)
     say(f"report: {folder / REPORT_FILE}")
-    say_next("eval", f"--policy.path={sides[-1].members[0].policy}", "--eval.films=3", f"--output_dir={folder}_eval")
+    say_next(
+        "eval",
+        f"--policy.path={sides[-1].members[0].policy}",
+        "--eval.films=3",
+        f"--output_dir={folder}_eval",
+    )
 
 
-def _measure(options: DemoOptions, config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[Side]:
-    """Run DAgger, clone from as many labels, and test both, round 0 and the expert (policy None)."""
+def _measure(
+    options: DemoOptions, config: RunConfig, folder: Path, engine: Engine, stages: Stages
+) -> list[Side]:
+    """Run DAgger, clone from as many labels, and test both, round 0 and the expert (policy
+    None).
+    """
     results = dagger(folder / "dagger", config, workers=engine, progress=stages)
     first, best = results[0], best_result(results)
     most = results[-1].labels
@@ -155,7 +185,10 @@ def _measure(options: DemoOptions, config: RunConfig, folder: Path, engine: Engi
         ("cloning with as many labels", policy, more.labels, CLONING),
         (f"DAgger (round {best.number})", best.policy, best.labels, DAGGER),
     )
-    sides = [Side(name, (Member(Path(name), policy=path),), colour, n) for name, path, n, colour in contestants]
+    sides = [
+        Side(name, (Member(Path(name), policy=path),), colour, n)
+        for name, path, n, colour in contestants
+    ]
     nominal, disturbed = (
         measure_sides(
             sides,
@@ -167,13 +200,21 @@ def _measure(options: DemoOptions, config: RunConfig, folder: Path, engine: Engi
             engine=engine,
             progress=stages,
         )
-        for suite, count in (("nominal", options.test_episodes), ("knocked", options.disturbed_episodes))
+        for suite, count in (
+            ("nominal", options.test_episodes),
+            ("knocked", options.disturbed_episodes),
+        )
     )
-    return [replace(side, disturbed=other.results[0]) for side, other in zip(nominal, disturbed, strict=True)]
+    return [
+        replace(side, disturbed=other.results[0])
+        for side, other in zip(nominal, disturbed, strict=True)
+    ]
 
 
 def _film(sides: Sequence[Side], config: RunConfig, stages: Stages) -> tuple[list[Film], str]:
-    """Film every policy on the first seed on which DAgger succeeds and cloning fails, else on the first seed."""
+    """Film every policy on the first seed on which DAgger succeeds and cloning fails, else on
+    the first seed.
+    """
     cloned, best = sides[1].results[0].episodes, sides[-1].results[0].episodes
     won = {episode.seed for episode in best if episode.success}
     seed = next((one.seed for one in cloned if not one.success and one.seed in won), cloned[0].seed)
@@ -190,19 +231,29 @@ def _film(sides: Sequence[Side], config: RunConfig, stages: Stages) -> tuple[lis
 
 
 _YAML = (".yaml", ".yml")
-_OF_STUDY = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study sets
+# options of a run that the study sets
+_OF_STUDY = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")
 
 
 def run_compare(options: CompareOptions) -> None:
     """Run the missing runs and evaluations, compare, print and write the result."""
     match options.sides:
         case [file] if file.suffix in _YAML:
-            _refuse(options, f"cannot be combined with a study; set them in {file}", "eval", "checkpoint", "at", "env")
+            _refuse(
+                options,
+                f"cannot be combined with a study; set them in {file}",
+                "eval",
+                "checkpoint",
+                "at",
+                "env",
+            )
             _run_study(options, file)
         case [left, right]:
             _compare(options, left, right)
         case _:
-            raise UsageError(f"{len(options.sides)} sides are given; expected two, or the YAML file of one study")
+            raise UsageError(
+                f"{len(options.sides)} sides are given; expected two, or the YAML file of one study"
+            )
 
 
 def _refuse(options: CompareOptions, why: str, *names: str) -> None:
@@ -228,9 +279,20 @@ def _compare(options: CompareOptions, left: Path, right: Path) -> None:
     first, *others = [member for side in both for member in side.members]
     envs = dict[str, EnvConfig]()
     if first.result:
-        _refuse(options, "change nothing for two evaluations; give two policies", "eval", "env", "suite", "seed")
+        _refuse(
+            options,
+            "change nothing for two evaluations; give two policies",
+            "eval",
+            "env",
+            "suite",
+            "seed",
+        )
         for other in others:
-            warn(*compare_fingerprints(first.name, first.test.fingerprint, other.name, other.test.fingerprint))
+            warn(
+                *compare_fingerprints(
+                    first.name, first.test.fingerprint, other.name, other.test.fingerprint
+                )
+            )
     else:
         envs = dict.fromkeys((side.name for side in both), _env(options, both))
     with options.lock() as prepare:
@@ -253,7 +315,10 @@ def _finish(
     """
     folder = options.output_dir
     rule, sides = select_rounds(Rule(how.checkpoint, how.at), sides)
-    with Stages(f"every finished episode, in {folder}", prepare) as stages, options.open_engine() as engine:
+    with (
+        Stages(f"every finished episode, in {folder}", prepare) as stages,
+        options.open_engine() as engine,
+    ):
         if envs:
             sides = measure_sides(
                 sides,
@@ -270,7 +335,15 @@ def _finish(
         if not envs:
             stages.started()
     page = compare_report(study, title)
-    publish(folder / FILE_NAME, study.to_json(), [study.table()], study.verdict, *study.facts, page=page, options=how)
+    publish(
+        folder / FILE_NAME,
+        study.to_json(),
+        [study.table()],
+        study.verdict,
+        *study.facts,
+        page=page,
+        options=how,
+    )
 
 
 def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
@@ -279,13 +352,19 @@ def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
     members = [member for side in sides for member in side.members]
     if runs := [member for member in members if member.history]:
         own = [given.pop(name, None) for name in ("robot", "task", "object")]
-        return require_same_env({run.name: replace(run.validation.env(*own), **given) for run in runs})
-    origins = {one.name: Checkpoint.open(one.policy).origin for one in members if one.policy is not None}
+        return require_same_env(
+            {run.name: replace(run.validation.env(*own), **given) for run in runs}
+        )
+    origins = {
+        one.name: Checkpoint.open(one.policy).origin for one in members if one.policy is not None
+    }
     return require_same_env({name: env_config(given, origin) for name, origin in origins.items()})
 
 
 class StudyPlan(NamedTuple):
-    """A checked study: options and environment of every arm, and the arm to compare others with, if any."""
+    """A checked study: options and environment of every arm, and the arm to compare others with,
+    if any.
+    """
 
     file: StudyFile
     arms: Mapping[str, DaggerOptions]
@@ -294,7 +373,9 @@ class StudyPlan(NamedTuple):
 
 
 def run_plan(plan: StudyPlan, root: Path, engine: EngineOptions) -> None:
-    """Run the missing runs, seed by seed, so that a study that is stopped early has runs of every arm."""
+    """Run the missing runs, seed by seed, so that a study that is stopped early has runs of
+    every arm.
+    """
     runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
     for number, (name, seed) in enumerate(runs, start=1):
         output = root / name / f"seed_{seed}"
@@ -321,13 +402,17 @@ def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False
     file = from_yaml(path, StudyFile)
     file = replace(file, training_seeds=training_seeds or file.training_seeds)
     if not file.arms:
-        raise UsageError(f"{path}: arms is empty; expected a mapping of names to options of manip-il dagger")
+        raise UsageError(
+            f"{path}: arms is empty; expected a mapping of names to options of manip-il dagger"
+        )
     arms, envs = dict[str, DaggerOptions](), dict[str, EnvConfig]()
     for name, own in file.arms.items():
         try:
             checks.name("its name, which becomes a folder,", name)
             layers = [("common", file.common), ("its options", own)]
-            if found := next((one for one in _OF_STUDY for _, tree in layers if one in (tree or {})), None):
+            if found := next(
+                (one for one in _OF_STUDY for _, tree in layers if one in (tree or {})), None
+            ):
                 raise UsageError(f"{found} is set by the study for every run; remove it")
             arms[name] = replace(from_layers(DaggerOptions, layers), trust=trust)
             config = dagger_config(arms[name])

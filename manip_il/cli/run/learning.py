@@ -1,4 +1,6 @@
-"""Run `manip-il rl gail`, `airl`, `ppo`: reinforcement learning from demonstrations or a learnt reward."""
+"""Run `manip-il rl gail`, `airl`, `ppo`: reinforcement learning from demonstrations or a learnt
+reward.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -34,16 +36,23 @@ def _run(options: Learning, config: LearningConfig) -> None:
                 if result.validated is not None:
                     say(f"{result.steps:,} steps: validation success {result.validated.success}")
         title = f"{options.method.upper()} on {config.env.robot} {config.env.task}"
-        page = validation_report(title, "initial policy", validations(folder), read_lines(folder / METRICS_FILE))
+        page = validation_report(
+            title, "initial policy", validations(folder), read_lines(folder / METRICS_FILE)
+        )
         replace(page, **about(options)).write(folder / REPORT_FILE)
     say_best(folder)
 
 
 def _config(options: Learning, spec: EnvironmentSpec | Origin, **more: Any) -> LearningConfig:
-    """Return the configuration for the environment of `spec`; `UnknownName` if that is not built in."""
+    """Return the configuration for the environment of `spec`.
+
+    `UnknownName` if that is not built in.
+    """
     env = stored_config(spec)
     start = None if options.init is None else find_policy(options.init)
-    return LearningConfig(method=options.method, env=env, ppo=options.ppo, start=start, **more, **options.settings)
+    return LearningConfig(
+        method=options.method, env=env, ppo=options.ppo, start=start, **more, **options.settings
+    )
 
 
 def run_gail(options: GailOptions) -> None:
@@ -55,7 +64,10 @@ run_airl = run_gail
 
 
 def run_ppo(options: PpoOptions) -> None:
-    """Improve a policy by PPO. Raises `MismatchError` if the reward does not fit the environment."""
+    """Improve a policy by PPO.
+
+    Raises `MismatchError` if the reward does not fit the environment.
+    """
     reward = LearnedReward.load(found := find_policy(options.reward))
     config = _config(options, reward.origin, reward=found)
     reward.check_fits("the environment", env_spec(config.env))
@@ -63,7 +75,10 @@ def run_ppo(options: PpoOptions) -> None:
 
 
 def imitation_config(options: GailOptions) -> LearningConfig:
-    """Return the configuration of the run; raises if the demonstrations are not of one known environment."""
+    """Return the configuration of the run.
+
+    Raises if the demonstrations are not of one known environment.
+    """
     roots = options.dataset.root
     specs = [open_dataset(root).spec for root in roots]
     check_same_sources(roots, specs, pictures=False, language=False)

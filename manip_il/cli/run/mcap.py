@@ -13,7 +13,11 @@ from manip_il.data.dataset import Dataset
 def run_mcap_export(options: McapExportOptions) -> None:
     """Export every episode; the folder appears when it is complete."""
     dataset = Dataset.open(options.dataset)
-    prepare_output({options.out: output_of("McapExport")}, overwrite=options.overwrite, sources=[options.dataset])
+    prepare_output(
+        {options.out: output_of("McapExport")},
+        overwrite=options.overwrite,
+        sources=[options.dataset],
+    )
     with new_folder(options.out) as folder, progress(dataset.info.episodes, "export") as bar:
         for _ in export_dataset(dataset, folder):
             bar.step()

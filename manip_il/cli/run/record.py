@@ -41,6 +41,9 @@ def run_record(options: RecordOptions) -> None:
         )
     episodes, frames = made.info.episodes, made.info.frames
     failed = len(list_seeds(journals)) - episodes
-    say(f"recorded {episodes:,} successful episodes, {frames:,} frames; demonstrations left out: {failed}")
+    say(
+        f"recorded {episodes:,} successful episodes, {frames:,} frames; demonstrations left out:"
+        f" {failed}"
+    )
     say(f"dataset: {root} (single episodes, to open in Foxglove: {journals})")
     say_next("train", f"--dataset.root={root}", f"--output_dir=runs/{root.name}")

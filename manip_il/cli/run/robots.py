@@ -24,11 +24,17 @@ PAGE = "check.html"
 
 
 def run_robot_new(options: RobotNewOptions) -> None:
-    """Write the YAML file, check the robot, print what is left to do. Raises `ManipError` if it can do no task."""
+    """Write the YAML file, check the robot, print what is left to do.
+
+    Raises `ManipError` if it can do no task.
+    """
     target = options.output or options.model.with_suffix(".yaml")
     checks.name(f"the name of {target}, which becomes the robot's,", target.stem)
     OutputFile(output=target, overwrite=options.overwrite).check()
-    paths = [os.path.relpath(path, target.parent) if path else "" for path in (options.model, options.gripper)]
+    paths = [
+        os.path.relpath(path, target.parent) if path else ""
+        for path in (options.model, options.gripper)
+    ]
     found = suggest(options.model, options.gripper)
     write_file(target, yaml_of(found, *paths).encode())
     say(f"robot: {target}")
@@ -41,13 +47,19 @@ def run_robot_new(options: RobotNewOptions) -> None:
 
 def run_robot_check(options: RobotCheckOptions) -> None:
     """Measure, print the tables, write the report. Raises `ManipError` if a task cannot be done."""
-    sweep(get_robot(options.robot))  # raises, before anything is written, if the robot cannot be used
+    # raises, before anything is written, if the robot cannot be used
+    sweep(get_robot(options.robot))
     tasks = options.tasks or list(NAMES)
     for task in tasks:
         get_task(task)
     with options.open() as folder:
-        with progress(2 * options.episodes * len(tasks), f"check {options.robot}") as bar, Engine(None) as engine:
-            found = robot_check.check_robot(options.robot, tasks, options.episodes, engine, lambda _: bar.step())
+        with (
+            progress(2 * options.episodes * len(tasks), f"check {options.robot}") as bar,
+            Engine(None) as engine,
+        ):
+            found = robot_check.check_robot(
+                options.robot, tasks, options.episodes, engine, lambda _: bar.step()
+            )
         write_json(folder / robot_check.FILE_NAME, found.to_json())
         replace(robot_check.check_report(found), **about(options)).write(folder / PAGE)
     robot_check.task_table(found).print()
@@ -55,7 +67,10 @@ def run_robot_check(options: RobotCheckOptions) -> None:
     say(f"page: {folder / PAGE}")
     if found.failed:
         names = ", ".join(task.name for task in found.failed)
-        raise ManipError(f"{options.robot} cannot do {len(found.failed)} of {len(tasks)} tasks: {names}; see above")
+        raise ManipError(
+            f"{options.robot} cannot do {len(found.failed)} of {len(tasks)} tasks: {names}; see"
+            " above"
+        )
 
 
 def run_certify(options: CertifyOptions) -> None:
@@ -63,7 +78,10 @@ def run_certify(options: CertifyOptions) -> None:
     env = env_config(options.env)
     with options.open() as folder:
         count = count_episodes(env, options.cases)
-        with progress(count, f"certify {env.robot} {env.task}") as bar, options.open_engine() as engine:
+        with (
+            progress(count, f"certify {env.robot} {env.task}") as bar,
+            options.open_engine() as engine,
+        ):
             certificate = certify(engine, env, options.cases, options.seed, lambda _: bar.step())
         mu = certificate.mu
         lines = () if mu is None else (f"u of Ross et al. (2011) is at least {mu} steps",)

@@ -30,8 +30,12 @@ def run_serve(options: ServeOptions) -> None:
     env, _, seen = open_driver(policy, options.env, trust=options.trust)
     cameras = options.camera_config(env) if options.cameras else seen
     if idle := [one for one in options.vary if one in _IDLE]:
-        raise UsageError(f"--vary={idle[0]} changes nothing for a served arm; use --servos.*, or --vary=servo")
-    conditions = varied([one for one in options.vary if one != SERVO], env, sees=cameras is not None)
+        raise UsageError(
+            f"--vary={idle[0]} changes nothing for a served arm; use --servos.*, or --vary=servo"
+        )
+    conditions = varied(
+        [one for one in options.vary if one != SERVO], env, sees=cameras is not None
+    )
     session = SessionConfig(**options.session, servos=options.servos, varies=SERVO in options.vary)
     with exclusive(session.output_dir):
         require_ours(session.output_dir, output_of("Serve"))

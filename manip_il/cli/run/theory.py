@@ -1,4 +1,6 @@
-"""Run `manip-il theory`: the proven bounds of cloning and DAgger, on small MDPs and on the rounds of a run."""
+"""Run `manip-il theory`: the proven bounds of cloning and DAgger, on small MDPs and on the
+rounds of a run.
+"""
 
 from itertools import chain
 from pathlib import Path
@@ -21,7 +23,14 @@ def run_theory(options: TheoryOptions) -> None:
         theory = Theory(tuple(chain(*map(curves, PROCESSES))), tuple(drifts()), shift)
         page = theory_report(theory)
         fact = f"policies above their bound: {theory.above}"
-        publish(folder / FILE_NAME, theory.to_json(), [slope_table(theory)], fact, page=page, options=options)
+        publish(
+            folder / FILE_NAME,
+            theory.to_json(),
+            [slope_table(theory)],
+            fact,
+            page=page,
+            options=options,
+        )
 
 
 def _shift(options: TheoryOptions, run: Path) -> Shift:
@@ -32,4 +41,6 @@ def _shift(options: TheoryOptions, run: Path) -> Shift:
     with progress(count, f"theory {run}") as bar, options.open_engine() as engine:
         certificate = certify(engine, env, options.cases, on_episode=lambda _: bar.step())
         u, conditions = certificate.mu or 0, validation.settings.conditions
-        return measure_shift(engine, env, rounds, u, options.episodes, lambda _: bar.step(), conditions)
+        return measure_shift(
+            engine, env, rounds, u, options.episodes, lambda _: bar.step(), conditions
+        )

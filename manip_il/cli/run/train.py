@@ -38,6 +38,12 @@ def run_train(options: TrainOptions) -> None:
     if first.own is None and (reason := why_not_simulated(policy)):
         say(f"no simulator of this program fits the policy: {reason}")
         words = "--policy.discover_packages_path=manip_il.lerobot_plugin", f"--fps={first.spec.fps}"
-        say_next("--strategy.type=base", path, *words, what="next, on its robot", program="lerobot-rollout")
+        say_next(
+            "--strategy.type=base",
+            path,
+            *words,
+            what="next, on its robot",
+            program="lerobot-rollout",
+        )
     else:
         say_next("eval", path, f"--output_dir={folder}/eval")

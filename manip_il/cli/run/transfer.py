@@ -16,9 +16,15 @@ def run_push(options: PushOptions) -> None:
     plan = push(options.source, remote, journals=options.journals, dry_run=options.dry_run)
     size = filesize.decimal(sum(plan.manifest.files[path].size for path in plan.upload))
     if options.dry_run:
-        say(*(f"upload   {path}" for path in plan.upload), *(f"remove   {path}" for path in plan.remove))
+        say(
+            *(f"upload   {path}" for path in plan.upload),
+            *(f"remove   {path}" for path in plan.remove),
+        )
     done = "would be " if options.dry_run else ""
-    say(f"{remote.name}: {len(plan.upload)} files, {size}, {done}uploaded; {len(plan.remove)} {done}removed")
+    say(
+        f"{remote.name}: {len(plan.upload)} files, {size}, {done}uploaded; {len(plan.remove)}"
+        f" {done}removed"
+    )
     if not options.dry_run:
         say_next("pull", remote.name, "FOLDER")
 

@@ -1,4 +1,6 @@
-"""Run `manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun if there is no display."""
+"""Run `manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun if there is no
+display.
+"""
 
 import contextlib
 import socket
@@ -33,14 +35,19 @@ def run_view(options: ViewOptions) -> None:
     if sliders:
         env_spec(env).require("shown in a window", "choose another --policy.type than sliders")
     in_window = in_window and "shown in a window" in env_spec(env).can
-    if cameras is None and not in_window:  # for people to watch; shadows only in files, which may take longer
-        cameras = CameraConfig(default_cameras(env), **SIZE, look=FILM if options.output else Look())
+    # for people to watch; shadows only in files, which may take longer
+    if cameras is None and not in_window:
+        cameras = CameraConfig(
+            default_cameras(env), **SIZE, look=FILM if options.output else Look()
+        )
     if sliders and not options.env.get("horizon"):
         env = replace(env, horizon=LONGEST_EPISODE)  # people are slower than the expert
     conditions = suite_conditions(options.suite, env, sees=in_window or cameras is not None)
     job = RolloutJob(env, driver, HOLD, conditions=conditions, cameras=cameras)
     world = make_env(env, observed_cameras(job), conditions)
-    seeds = stream_seeds("validation", options.n_episodes or (IN_A_FILE if options.output else BLOCK), options.seed)
+    seeds = stream_seeds(
+        "validation", options.n_episodes or (IN_A_FILE if options.output else BLOCK), options.seed
+    )
     with contextlib.closing(_screen(options, world, env, in_window)) as screen:
         for step in run_steps(job, [world], seeds, screen.act):
             if not screen.add(step):
@@ -51,11 +58,16 @@ def run_view(options: ViewOptions) -> None:
         say(f"next: rerun {options.output}")
 
 
-def _screen(options: ViewOptions, env: Any, config: EnvConfig, in_window: bool) -> WindowScreen | RerunLog:
+def _screen(
+    options: ViewOptions, env: Any, config: EnvConfig, in_window: bool
+) -> WindowScreen | RerunLog:
     if in_window:
         return WindowScreen(env, sliders=options.policy.type == "sliders")
     log = RerunLog(config, options.output)
     if log.address:
         ports = " ".join(f"-L {port}:localhost:{port}" for port in log.ports)
-        say(f"open: {log.address}", f"from another machine first: ssh {ports} {socket.gethostname()}")
+        say(
+            f"open: {log.address}",
+            f"from another machine first: ssh {ports} {socket.gethostname()}",
+        )
     return log

@@ -1,11 +1,14 @@
-"""A grid over a layout's free space, its costs-to-go for a reward, and how to descend them from any position.
+"""A grid over a layout's free space, its costs-to-go for a reward, and how to descend them from any
+position.
 
-The goal is one of the grid's nodes. Features are integrated along the grid's edges as along any path, so that inverse
-reinforcement learning can compare demonstrated paths with those on the grid.
+The goal is one of the grid's nodes. Features are integrated along the grid's edges as along any
+path, so that inverse reinforcement learning can compare demonstrated paths with those on the grid.
 
-Paths to a goal on a graph whose edges have features: weights turn features into costs, Dijkstra finds cheap paths.
+Paths to a goal on a graph whose edges have features: weights turn features into costs, Dijkstra
+finds cheap paths.
 
-Demonstrations are paths to the goal. Weights are inferred by comparing each demonstration with alternative paths.
+Demonstrations are paths to the goal. Weights are inferred by comparing each demonstration with
+alternative paths.
 """
 
 from collections.abc import Sequence
@@ -35,8 +38,9 @@ _SAME = 1e-6  # largest difference between equal feature sums [m]
 class PathProblem:
     """S nodes, E edges with K features each, one goal.
 
-    edges: nodes (from, to), (E, 2), each pair once, without self-loops. features: (E, K), 0 or more; the first one is
-    the edge's length [m], above 0; another may be the part of this length that lies above an object on the table [m].
+    edges: nodes (from, to), (E, 2), each pair once, without self-loops. features: (E, K), 0 or
+    more; the first one is the edge's length [m], above 0; another may be the part of this length
+    that lies above an object on the table [m].
     """
 
     edges: I64
@@ -47,19 +51,29 @@ class PathProblem:
     @cached_property
     def numbers(self) -> Any:
         """Edge numbers, counted from 1, as a sparse matrix (from, to), (S, S)."""
-        return csr_array((np.arange(1, len(self.edges) + 1), self.edges.T), shape=(self.nodes, self.nodes))
+        return csr_array(
+            (np.arange(1, len(self.edges) + 1), self.edges.T), shape=(self.nodes, self.nodes)
+        )
 
     def costs(self, weights: F64) -> F64:
         """Return the cost of every edge, (E,), for non-negative weights (K,)."""
         return self.features @ weights
 
     def matrix(self, values: F64) -> Any:
-        """Return the edges' values (E,) as a sparse matrix (from, to), (S, S). Zeros are stored, too."""
+        """Return the edges' values (E,) as a sparse matrix (from, to), (S, S).
+
+        Zeros are stored, too.
+        """
         numbers = self.numbers
-        return csr_array((values[numbers.data - 1], numbers.indices, numbers.indptr), shape=numbers.shape)
+        return csr_array(
+            (values[numbers.data - 1], numbers.indices, numbers.indptr), shape=numbers.shape
+        )
 
     def sums(self, path: I64) -> F64:
-        """Return the feature sums (K,) over the edges of a path of nodes (n,). Raises `ManipError` without one."""
+        """Return the feature sums (K,) over the edges of a path of nodes (n,).
+
+        Raises `ManipError` without one.
+        """
         edges = np.array([self.numbers[pair] for pair in pairwise(path.tolist())], np.int64) - 1
         if (edges < 0).any():
             raise ManipError("no edge joins two consecutive nodes of a path")
@@ -70,8 +84,8 @@ class PathProblem:
 class Plan:
     """The cheapest path to the goal from every node.
 
-    costs: (S,), infinite if no path leads to the goal. following: the next node, (S,), negative at the goal and if
-    there is no path.
+    costs: (S,), infinite if no path leads to the goal. following: the next node, (S,), negative at
+    the goal and if there is no path.
     """
 
     costs: F64
@@ -84,8 +98,12 @@ def plan(problem: PathProblem, weights: F64) -> Plan:
 
 
 def plan_edges(problem: PathProblem, costs: F64) -> Plan:
-    """Return the cheapest path from every node for edge costs (E,), 0 or more: Dijkstra backwards from the goal."""
-    found, following = dijkstra(problem.matrix(costs).T.tocsr(), indices=problem.goal, return_predecessors=True)
+    """Return the cheapest path from every node for edge costs (E,), 0 or more: Dijkstra
+    backwards from the goal.
+    """
+    found, following = dijkstra(
+        problem.matrix(costs).T.tocsr(), indices=problem.goal, return_predecessors=True
+    )
     return Plan(found, following)
 
 
@@ -122,7 +140,9 @@ class Demonstration:
 
 
 def stages(demonstrations: Sequence[Demonstration]) -> list[Sequence[Demonstration]]:
-    """Return the sets of demonstrations to fit in turn: every fifth one (skipped if these are too few), then all."""
+    """Return the sets of demonstrations to fit in turn: every fifth one (skipped if these are
+    too few), then all.
+    """
     few = demonstrations[::_EVERY]
     return [few, demonstrations] if len(few) >= _FEW else [demonstrations]
 
@@ -130,17 +150,23 @@ def stages(demonstrations: Sequence[Demonstration]) -> list[Sequence[Demonstrati
 def rivals(demonstrations: Sequence[Demonstration], tastes: F64) -> list[F64]:
     """Return the feature sums (m, K) of each demonstration's alternatives.
 
-    Alternatives are the distinct paths that are cheapest for one of the weight vectors `tastes` (n, K). The
-    demonstration's own sums come first, so m is at most n + 1.
+    Alternatives are the distinct paths that are cheapest for one of the weight vectors `tastes` (n,
+    K). The demonstration's own sums come first, so m is at most n + 1.
     """
     return add_rivals(demonstrations, [one.sums[None] for one in demonstrations], tastes)
 
 
-def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tastes: F64) -> list[F64]:
-    """Return the `sums` of `rivals`, (m, K) each, with the alternatives for further weight vectors `tastes` (n, K)."""
+def add_rivals(
+    demonstrations: Sequence[Demonstration], sums: Sequence[F64], tastes: F64
+) -> list[F64]:
+    """Return the `sums` of `rivals`, (m, K) each, with the alternatives for further weight
+    vectors `tastes` (n, K).
+    """
     found = []
     for one, known in zip(demonstrations, sums, strict=True):
-        more = [cheapest_path(one.problem, plan(one.problem, taste), one.start)[1] for taste in tastes]
+        more = [
+            cheapest_path(one.problem, plan(one.problem, taste), one.start)[1] for taste in tastes
+        ]
         every = np.concatenate([known, more])
         _, first = np.unique(every.round(_DIGITS), axis=0, return_index=True)
         found.append(every[np.sort(first)])
@@ -148,11 +174,15 @@ def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tas
 
 
 def open_features(demonstrations: Sequence[Demonstration], sums: Sequence[F64]) -> list[int]:
-    """Return the indices of the features in which no demonstration differs from its alternatives `sums` (m, K).
+    """Return the indices of the features in which no demonstration differs from its alternatives
+    `sums` (m, K).
 
     The weights of these features are not identified.
     """
-    off = [np.abs(others - one.sums).max(axis=0) for one, others in zip(demonstrations, sums, strict=True)]
+    off = [
+        np.abs(others - one.sums).max(axis=0)
+        for one, others in zip(demonstrations, sums, strict=True)
+    ]
     return [int(k) for k in np.flatnonzero(np.max(off, axis=0) <= _SAME)]
 
 
@@ -160,15 +190,20 @@ CELL = 0.02  # grid spacing, at full scale [m]
 BEYOND = 0.09  # how far the grid extends beyond the workspace's half width, at full scale [m]
 TOP = 0.32  # height of the grid over the table, at full scale [m]
 LIFTED = 0.02  # least height of the object over its resting height, except near the goal [m]
-DOWN = 0.03  # sideways distance from the goal within which the object may be lower, at full scale [m]
+# sideways distance from the goal within which the object may be lower, at full scale [m]
+DOWN = 0.03
 AHEAD = 3  # how far the descent looks ahead [cells]
 OUTSIDE = 0.12  # largest distance to a node with a path if none is nearby, at full scale [m]
 KEPT = 26  # plans cached per process: one per environment in lockstep, and one more
-_STEEP, _SHORT = 0.004, 0.3  # softmin over nodes: temperature as path length [m]; share of price added to near nodes
-_QUARTERS = np.array([0.25, 0.5, 0.75])  # shares of a line at which its room and its costs are evaluated
+# softmin over nodes: temperature as path length [m]; share of price added to near nodes
+_STEEP, _SHORT = 0.004, 0.3
+# shares of a line at which its room and its costs are evaluated
+_QUARTERS = np.array([0.25, 0.5, 0.75])
 _LOOK = 24  # most points of a snapped path, a quarter cell apart, that one edge may replace
-_SLACK = 0.003  # lack of room that a line may have, because it may start beside a node with none to spare [m]
-_WORSE = 1e-4  # how much less room than at the start is tolerated on the way out of a tight place [m]
+# lack of room that a line may have, because it may start beside a node with none to spare [m]
+_SLACK = 0.003
+# how much less room than at the start is tolerated on the way out of a tight place [m]
+_WORSE = 1e-4
 
 
 class _Links(NamedTuple):
@@ -188,7 +223,9 @@ def _links(shape: tuple[int, ...]) -> _Links:
     start, end = np.broadcast_to(places, to.shape)[inside], to[inside]
     nodes = [_numbers(index, shape) for index in (start, end)]
     doubled = [_numbers(index, _finer(shape)) for index in (2 * start, start + end, 2 * end)]
-    return _Links(np.stack(nodes, axis=1), np.stack(doubled, axis=1), np.linalg.norm(end - start, axis=1))
+    return _Links(
+        np.stack(nodes, axis=1), np.stack(doubled, axis=1), np.linalg.norm(end - start, axis=1)
+    )
 
 
 def _finer(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -209,7 +246,8 @@ def _numbers(index: I64, shape: tuple[int, ...]) -> I64:
 class Grid:
     """Nodes of a layout's free space, each joined to the 26 around it.
 
-    shape: node counts along x, y and z; origin: first node's place (3,) [m]; cell: spacing [m]; goal: its node number.
+    shape: node counts along x, y and z; origin: first node's place (3,) [m]; cell: spacing [m];
+    goal: its node number.
     """
 
     def __init__(self, layout: Layout, robot: Robot):
@@ -237,7 +275,9 @@ class Grid:
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
-        """Whether an object may be at each node, (S,): within reach, clear of obstacles, and lifted."""
+        """Whether an object may be at each node, (S,): within reach, clear of obstacles, and
+        lifted.
+        """
         layout, points = self.layout, self.points
         off = np.hypot(*(points[:, :2] - np.array(layout.goal[:2])).T)
         low = (points[:, 2] < layout.half + LIFTED - 1e-9) & (off > DOWN * layout.scale)
@@ -255,19 +295,25 @@ class Grid:
         return _Links(every.edges[kept], every.fine[kept], self.cell * every.cells[kept])
 
     def _integrals(self, densities: F64) -> F64:
-        """Integrals (E, ...) along the edges of densities (F, ...) at nodes and middles, by Simpson's rule."""
+        """Integrals (E, ...) along the edges of densities (F, ...) at nodes and middles, by
+        Simpson's rule.
+        """
         start, middle, end = (densities[places] for places in self._links.fine.T)
         lengths = self._links.cells.reshape(-1, *[1] * (densities.ndim - 1))
         return lengths * (start + 4 * middle + end) / 6
 
     @cached_property
     def problem(self) -> PathProblem:
-        """The grid's edges, with features integrated along each, as a problem for inverse reinforcement learning."""
+        """The grid's edges, with features integrated along each, as a problem for inverse
+        reinforcement learning.
+        """
         features = self._integrals(self.layout.densities(self._fine))
         return PathProblem(self._links.edges, features, len(self.points), self.goal)
 
     def costs_to_go(self, weights: F64) -> F64:
-        """Return the cost of the cheapest path to the goal from every node, (S,), for weights (K,)."""
+        """Return the cost of the cheapest path to the goal from every node, (S,), for weights
+        (K,).
+        """
         costs = self._integrals(self.layout.densities(self._fine) @ weights)
         return self._plan(costs, self.goal)[1].costs
 
@@ -285,22 +331,33 @@ class Grid:
         return nodes[np.linalg.norm(self.points[nodes] - position, axis=1) < AHEAD * self.cell]
 
     def snap(self, positions: F64) -> I64:
-        """Return a path of free nodes, (n,), each joined to the next, that follows positions (T, 3) [m].
+        """Return a path of free nodes, (n,), each joined to the next, that follows positions (T, 3)
+        [m].
 
-        If the positions lie on a straight line, the path is no longer than the shortest path in the grid. Gaps without
-        free nodes are bridged by the shortest path. If the positions end near the goal, the path is extended to it.
+        If the positions lie on a straight line, the path is no longer than the shortest path in the
+        grid. Gaps without free nodes are bridged by the shortest path. If the positions end near
+        the goal, the path is extended to it.
         """
         dense = _dense(positions, self.cell / 4)
-        index = np.round((dense - self.origin) / self.cell).astype(np.int64).clip(0, np.array(self.shape) - 1)
+        index = (
+            np.round((dense - self.origin) / self.cell)
+            .astype(np.int64)
+            .clip(0, np.array(self.shape) - 1)
+        )
         every = _numbers(index, self.shape)
         nodes: list[int] = every[self.free[every]].tolist()
         if np.linalg.norm(positions[-1] - self.points[self.goal]) < AHEAD * self.cell:
             nodes.append(self.goal)
         path = nodes[:1]
         while path and path[-1] != nodes[-1]:
-            begin = len(nodes) - 1 - nodes[::-1].index(path[-1])  # skips detours that return to this node
+            # skips detours that return to this node
+            begin = len(nodes) - 1 - nodes[::-1].index(path[-1])
             nodes = nodes[begin:]
-            ahead = [place for place, node in enumerate(nodes[1:_LOOK], 1) if self.problem.numbers[path[-1], node]]
+            ahead = [
+                place
+                for place, node in enumerate(nodes[1:_LOOK], 1)
+                if self.problem.numbers[path[-1], node]
+            ]
             last = ahead[-1] if ahead else 1
             path += [nodes[last]] if ahead else self._between(path[-1], nodes[last])
             nodes = nodes[last:]
@@ -338,20 +395,27 @@ class Descent:
         return len(self._around(position)) > 0
 
     def _around(self, position: F64) -> I64:
-        """Numbers (n,) of nodes with a path: those within `AHEAD` cells of a position (3,) [m], else the nearest."""
+        """Numbers (n,) of nodes with a path: those within `AHEAD` cells of a position (3,) [m],
+        else the nearest.
+        """
         nodes = self.grid.near(position)
         nodes = nodes[np.isfinite(self.costs[nodes])]
         if len(nodes):
             return nodes
-        off = np.where(np.isfinite(self.costs), np.linalg.norm(self.grid.points - position, axis=1), np.inf)
+        off = np.where(
+            np.isfinite(self.costs), np.linalg.norm(self.grid.points - position, axis=1), np.inf
+        )
         nearest = int(np.argmin(off))
-        return np.array([nearest] if off[nearest] < OUTSIDE * self.grid.layout.scale else [], np.int64)
+        return np.array(
+            [nearest] if off[nearest] < OUTSIDE * self.grid.layout.scale else [], np.int64
+        )
 
     def look(self, position: F64) -> tuple[float, F64 | None]:
-        """Return the cost-to-go at a position (3,) [m], and a point to head for, about `AHEAD` cells away, (3,) [m].
+        """Return the cost-to-go at a position (3,) [m], and a point to head for, about `AHEAD`
+        cells away, (3,) [m].
 
-        The cost is that of the cheapest way: a straight line to a node, and the path from there. It is infinite, and
-        the point None, if no free line leads to a node with a path.
+        The cost is that of the cheapest way: a straight line to a node, and the path from there. It
+        is infinite, and the point None, if no free line leads to a node with a path.
         """
         nodes = self._around(position)
         ends = self.grid.points[nodes]
@@ -360,12 +424,15 @@ class Descent:
         layout, here = self.grid.layout, position[None]
         spare = min(-_SLACK, float(layout.room(here)[0]) - _WORSE)
         points = (position + _QUARTERS[:, None, None] * (ends - position)).reshape(-1, 3)
-        free: NDArray[np.bool_] = np.all(layout.room(points).reshape(len(_QUARTERS), -1) >= spare, axis=0)
+        free: NDArray[np.bool_] = np.all(
+            layout.room(points).reshape(len(_QUARTERS), -1) >= spare, axis=0
+        )
         if not free.any():
             return np.inf, None
         price = float(self._prices(here)[0])
         between = self._prices(points).reshape(len(_QUARTERS), -1)
-        means = (price + np.array([4.0, 2.0, 4.0]) @ between + self._prices(ends)) / 12  # Simpson's rule
+        # Simpson's rule
+        means = (price + np.array([4.0, 2.0, 4.0]) @ between + self._prices(ends)) / 12
         off = np.linalg.norm(ends - position, axis=1)
         totals = off * means + self.costs[nodes]
         nodes = nodes[free]
@@ -389,6 +456,9 @@ class Descent:
 
 @lru_cache(KEPT)
 def descent(layout: Layout, reward: Reward, robot: Robot) -> Descent:
-    """Return a layout's costs-to-go for a reward, as a `Descent` to the goal; computed once and cached."""
+    """Return a layout's costs-to-go for a reward, as a `Descent` to the goal.
+
+    Computed once and cached.
+    """
     grid, weights = Grid(layout, robot), np.array(reward.weights)
     return Descent(grid, grid.costs_to_go(weights), weights)

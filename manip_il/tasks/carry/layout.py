@@ -1,7 +1,10 @@
-"""Layouts of `carry`: what stands on the table, as pure geometry. Rewards: what a metre of path costs there.
+"""Layouts of `carry`: what stands on the table, as pure geometry.
 
-Paths are those of the carried object's centre. Features are densities per metre of path, functions of a point alone;
-for a path of points, or an edge of the grid, they are integrated along it. A reward has a weight for each feature.
+Rewards: what a metre of path costs there.
+
+Paths are those of the carried object's centre. Features are densities per metre of path, functions
+of a point alone; for a path of points, or an edge of the grid, they are integrated along it. A
+reward has a weight for each feature.
 """
 
 from __future__ import annotations
@@ -36,7 +39,9 @@ MOST = 1e6  # largest weight
 
 
 class Obstacle(NamedTuple):
-    """Half lengths along x and y, and height of an obstacle [m], for an arm whose workspace is 30 cm wide."""
+    """Half lengths along x and y, and height of an obstacle [m], for an arm whose workspace is
+    30 cm wide.
+    """
 
     half: tuple[float, float]
     height: float
@@ -48,7 +53,8 @@ OBSTACLES = {
     "candle": Obstacle((0.016, 0.016), 0.11),
 }
 FULL = 0.15  # half width of a workspace in which obstacles have these sizes [m]
-ASIDE, ABOVE = 0.012, 0.012  # clearance between an obstacle and what is carried past it, beside and over it [m]
+# clearance between an obstacle and what is carried past it, beside and over it [m]
+ASIDE, ABOVE = 0.012, 0.012
 HEIGHT = 0.1  # unit of the feature `height` [m]
 OVER = 0.015  # standard deviation of the `above` features beside an obstacle [m]
 NEAR = 0.08  # standard deviation of the `near` features of obstacles [m]
@@ -64,7 +70,9 @@ class Edge(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Part of object or hand: height of its lowest point, and its radius, both from the object's centre [m]."""
+    """Part of object or hand: height of its lowest point, and its radius, both from the object's
+    centre [m].
+    """
 
     bottom: float
     radius: float
@@ -74,9 +82,10 @@ class Part(NamedTuple):
 class Layout:
     """What stands on the table in one episode.
 
-    scale: factor on all lengths, 1 for a workspace of half width `FULL`. goal: target of the object's centre [m].
-    places: (x, y) [m] of the obstacles present, by name. edge: the table's; None if it is not near. half: half
-    the object's height [m]. parts: of object and hand, relative to the object's centre.
+    scale: factor on all lengths, 1 for a workspace of half width `FULL`. goal: target of the
+    object's centre [m]. places: (x, y) [m] of the obstacles present, by name. edge: the table's;
+    None if it is not near. half: half the object's height [m]. parts: of object and hand, relative
+    to the object's centre.
     """
 
     scale: float
@@ -90,7 +99,12 @@ class Layout:
     def boxes(self) -> tuple[tuple[str, F64, F64, float], ...]:
         """Name, middle (2,), half lengths (2,) and height of every obstacle present [m]."""
         return tuple(
-            (name, np.array(place), self.scale * np.array(OBSTACLES[name].half), self.scale * OBSTACLES[name].height)
+            (
+                name,
+                np.array(place),
+                self.scale * np.array(OBSTACLES[name].half),
+                self.scale * OBSTACLES[name].height,
+            )
             for name, place in self.places
         )
 
@@ -112,7 +126,9 @@ class Layout:
             found[:, FEATURES.index(f"above_{name}")] = _bump(off, OVER)
             found[:, FEATURES.index(f"near_{name}")] = _bump(off, NEAR)
         if self.edge is not None:
-            inside = np.maximum((np.array(self.edge.at) - points[:, :2]) @ np.array(self.edge.outwards), 0.0)
+            inside = np.maximum(
+                (np.array(self.edge.at) - points[:, :2]) @ np.array(self.edge.outwards), 0.0
+            )
             found[:, FEATURES.index("near_edge")] = _bump(inside / self.scale, NEAR_EDGE)
         return found
 
@@ -130,9 +146,14 @@ class Layout:
         return found
 
     def is_free(self, start: F64, end: F64, spare: float) -> bool:
-        """Return whether `room` is at least `spare` [m] all along the straight line from `start` to `end`, (3,) [m]."""
+        """Return whether `room` is at least `spare` [m] all along the straight line from `start`
+        to `end`, (3,) [m].
+        """
         pieces = max(1, math.ceil(np.linalg.norm(end - start) / (2 * STEP)))
-        return bool(self.room(start + np.linspace(0.0, 1.0, pieces + 1)[:, None] * (end - start)).min() >= spare)
+        return bool(
+            self.room(start + np.linspace(0.0, 1.0, pieces + 1)[:, None] * (end - start)).min()
+            >= spare
+        )
 
 
 def _beside(points: F64, middle: F64, half: F64) -> F64:
@@ -146,10 +167,11 @@ def _bump(off: F64, width: float) -> F64:
 
 @dataclass(frozen=True)
 class Reward:
-    """Weights, in the order of `FEATURES`: each is the cost of a metre of path on which its feature is 1.
+    """Weights, in the order of `FEATURES`: each is the cost of a metre of path on which its feature
+    is 1.
 
-    Raises `UsageError` for a weight outside 0 to `MOST`, and for a weight of 0 for `length`: paths could then have
-    any length.
+    Raises `UsageError` for a weight outside 0 to `MOST`, and for a weight of 0 for `length`: paths
+    could then have any length.
     """
 
     weights: tuple[float, ...]
@@ -159,11 +181,17 @@ class Reward:
             if not 0 <= weight <= MOST:
                 raise UsageError(f"weight of {name} is {weight:g}; expected 0 to {MOST:g}")
         if not self.weights[0]:
-            raise UsageError("weight of length is 0; expected more than 0, as paths could otherwise have any length")
+            raise UsageError(
+                "weight of length is 0; expected more than 0, as paths could otherwise have any"
+                " length"
+            )
 
     @classmethod
     def of(cls, weights: Mapping[str, float]) -> Reward:
-        """Return a reward from weights by feature, 0 by default. Raises `UnknownName` for an unknown feature."""
+        """Return a reward from weights by feature, 0 by default.
+
+        Raises `UnknownName` for an unknown feature.
+        """
         if unknown := [name for name in weights if name not in FEATURES]:
             raise UnknownName("feature", unknown[0], FEATURES)
         return cls(tuple(weights.get(name, 0.0) for name in FEATURES))
@@ -172,7 +200,8 @@ class Reward:
     def parse(cls, text: NameOrPath) -> Reward:
         """Return the reward that a text describes: the name of a shipped one, or `NAME=NUMBER,...`.
 
-        A `Path` is a `reward.json`, whose lists `names` and `weights` are read. Raises `UsageError` for anything else.
+        A `Path` is a `reward.json`, whose lists `names` and `weights` are read. Raises `UsageError`
+        for anything else.
         """
         if (shipped := TASTES.get(str(text))) is not None:
             return shipped
@@ -184,15 +213,21 @@ class Reward:
                 pairs = [word.split("=") for word in text.split(",")]
             weights = {str(name).strip(): float(weight) for name, weight in pairs}
         except (ManipError, LookupError, TypeError, ValueError) as error:
-            expected = f"{', '.join(TASTES)}, reward.json with names and weights, or NAME=NUMBER,..."
-            raise UsageError(f"reward is {shorten(str(text))}: {checks.one_line(error)}; expected {expected}") from None
+            expected = (
+                f"{', '.join(TASTES)}, reward.json with names and weights, or NAME=NUMBER,..."
+            )
+            raise UsageError(
+                f"reward is {shorten(str(text))}: {checks.one_line(error)}; expected {expected}"
+            ) from None
         return cls.of(weights)
 
     @property
     def numbers(self) -> str:
         """The nonzero weights as `NAME=NUMBER,...`, not rounded."""
         pairs = zip(FEATURES, self.weights, strict=True)
-        return ",".join(f"{name}={repr(weight).removesuffix('.0')}" for name, weight in pairs if weight)
+        return ",".join(
+            f"{name}={repr(weight).removesuffix('.0')}" for name, weight in pairs if weight
+        )
 
 
 TASTES: dict[str, Reward] = {

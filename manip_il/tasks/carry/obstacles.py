@@ -1,4 +1,6 @@
-"""Bodies of `carry`'s obstacles, a world's layout and reward, and the parts of a hand that may hit an obstacle."""
+"""Bodies of `carry`'s obstacles, a world's layout and reward, and the parts of a hand that may
+hit an obstacle.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,12 +13,23 @@ import numpy as np
 from manip_il.mdp import F64
 from manip_il.robots.geometry import outline
 from manip_il.sim.world import SCENES_KEPT, Scene, World
-from manip_il.tasks.carry.layout import DEFAULT, FEATURES, FULL, OBSTACLES, TASTES, Edge, Layout, Part, Reward
+from manip_il.tasks.carry.layout import (
+    DEFAULT,
+    FEATURES,
+    FULL,
+    OBSTACLES,
+    TASTES,
+    Edge,
+    Layout,
+    Part,
+    Reward,
+)
 from manip_il.tasks.grasp import once_per_state
 from manip_il.tasks.objects import add_furniture, add_part
 
 EDGE = "edge"  # the mocap body of the table's edge; its x points away from the table
-TASTE_BODIES = tuple(f"taste_{number}" for number in range(len(FEATURES) // 3))  # mocap bodies that hold the weights
+# mocap bodies that hold the weights
+TASTE_BODIES = tuple(f"taste_{number}" for number in range(len(FEATURES) // 3))
 LEANING = 0.01  # extra radius of a leaning hand [m]
 _ALIKE = 0.005  # difference of radii up to which parts count as one [m]
 _BARELY = 0.004  # clearance of a grasping hand from an obstacle beside it [m]
@@ -41,7 +54,9 @@ _LOOKS = {  # visual geoms: kind, half size and middle in shares of the obstacle
 
 
 def add_obstacles(spec: mujoco.MjSpec, scale: float) -> None:
-    """Add the obstacles, their contact boxes, the table's edge, and bodies whose positions are the reward's weights."""
+    """Add the obstacles, their contact boxes, the table's edge, and bodies whose positions are
+    the reward's weights.
+    """
     for name, obstacle in OBSTACLES.items():
         body = add_furniture(spec, name)
         body.pos = [0.5, 0, -PARKED]
@@ -50,16 +65,26 @@ def add_obstacles(spec: mujoco.MjSpec, scale: float) -> None:
         body.first_geom().rgba = [0, 0, 0, 0]  # invisible: the visual geoms lie within it
         for kind, (wide, tall), middle, colour in _LOOKS[name]:
             size = half * [wide, wide, 2 * tall]
-            _add_look(body, kind, size if kind != "CYLINDER" else size[[0, 2, 2]], middle * 2 * half[2], colour)
+            _add_look(
+                body,
+                kind,
+                size if kind != "CYLINDER" else size[[0, 2, 2]],
+                middle * 2 * half[2],
+                colour,
+            )
     edge = add_furniture(spec, EDGE)
     edge.pos = [0.5, 0, -PARKED]
     plate = scale * np.array(_PLATE)
     _add_look(edge, "BOX", plate, 0.0, _DARK, ahead=float(plate[0]))
-    for name, weights in zip(TASTE_BODIES, np.reshape(TASTES[DEFAULT].weights, (-1, 3)), strict=True):
+    for name, weights in zip(
+        TASTE_BODIES, np.reshape(TASTES[DEFAULT].weights, (-1, 3)), strict=True
+    ):
         add_furniture(spec, name).pos = weights
 
 
-def _add_look(body: object, kind: str, size: F64, up: float, colour: Sequence[float], ahead: float = 0.0) -> None:
+def _add_look(
+    body: object, kind: str, size: F64, up: float, colour: Sequence[float], ahead: float = 0.0
+) -> None:
     body.add_geom(  # pyright: ignore[reportAttributeAccessIssue]
         type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"),
         size=size.tolist(),
@@ -97,9 +122,14 @@ def layout_of(world: World, name: str) -> Layout:
 
 
 def make_layout(
-    scene: Scene, lengths: Sequence[float], goal: F64, places: Mapping[str, F64], edge: tuple[F64, F64] | None
+    scene: Scene,
+    lengths: Sequence[float],
+    goal: F64,
+    places: Mapping[str, F64],
+    edge: tuple[F64, F64] | None,
 ) -> Layout:
-    """Return the layout for an object of lengths (3,) [m], a goal (3,) [m], places of obstacles (3,) [m], and an edge.
+    """Return the layout for an object of lengths (3,) [m], a goal (3,) [m], places of obstacles
+    (3,) [m], and an edge.
 
     edge: a point on it (3,) [m] and the direction away from the table, (3,).
     """
@@ -108,7 +138,9 @@ def make_layout(
     return Layout(
         scale=scale_of(scene),
         goal=tuple(goal.tolist()),
-        places=tuple((name, tuple(places[name][:2].tolist())) for name in OBSTACLES if name in places),
+        places=tuple(
+            (name, tuple(places[name][:2].tolist())) for name in OBSTACLES if name in places
+        ),
         edge=edge and Edge(*(tuple(vector[:2].tolist()) for vector in edge)),
         half=longest / 2,
         parts=(own, *hand_of(scene).parts),
@@ -116,7 +148,10 @@ def make_layout(
 
 
 def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layout:
-    """Return the layout that an observation describes. name: the object's; seen: `environment_state` by name."""
+    """Return the layout that an observation describes. name: the object's.
+
+    seen: `environment_state` by name.
+    """
 
     def vector(of: str) -> F64:
         return np.array([seen[f"{of}.{axis}"] for axis in "xyz"], dtype=np.float64)
@@ -129,7 +164,9 @@ def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layou
 
 
 def observe_obstacles(world: World) -> dict[str, F64 | float]:
-    """Return all obstacles' positions [m] and presence, and the table's edge: a point on it, its outward axis."""
+    """Return all obstacles' positions [m] and presence, and the table's edge: a point on it, its
+    outward axis.
+    """
     found: dict[str, F64 | float] = {}
     for name in (*OBSTACLES, EDGE):
         found |= {name: world.at(name), f"{name}.here": float(is_there(world, name))}
@@ -139,7 +176,8 @@ def observe_obstacles(world: World) -> dict[str, F64 | float]:
 class Box(NamedTuple):
     """Upright box around a part of the hand, relative to `ee`.
 
-    bottom: height of its lowest point [m]. middle, half: centre and half-lengths along the hand's x and y, (2,) [m].
+    bottom: height of its lowest point [m]. middle, half: centre and half-lengths along the hand's x
+    and y, (2,) [m].
     """
 
     bottom: float
@@ -148,7 +186,9 @@ class Box(NamedTuple):
 
 
 class HandShape(NamedTuple):
-    """The open, downward hand. parts: lowest points and radii about the vertical through `ee`; boxes: one per geom.
+    """The open, downward hand. parts: lowest points and radii about the vertical through `ee`.
+
+    boxes: one per geom.
 
     home: position of `ee` in the arm's home pose, (3,) [m].
     """
@@ -170,7 +210,8 @@ def hand_of(scene: Scene) -> HandShape:
     outlines = [
         outline(model, data, geom) - ee
         for geom in range(model.ngeom)
-        if model.geom_bodyid[geom] in moved and (model.geom_contype[geom] or model.geom_conaffinity[geom])
+        if model.geom_bodyid[geom] in moved
+        and (model.geom_contype[geom] or model.geom_conaffinity[geom])
     ]
     parts = _parts(outlines, LEANING if scene.robot.leans else 0.0)
     return HandShape(parts, tuple(_box(points, axes) for points in outlines), ee.copy())
@@ -178,7 +219,10 @@ def hand_of(scene: Scene) -> HandShape:
 
 def _parts(outlines: Sequence[F64], lean: float) -> tuple[Part, ...]:
     parts: list[Part] = []
-    found = ((float(z.min()), float(np.hypot(x, y).max()) + lean) for x, y, z in map(np.transpose, outlines))
+    found = (
+        (float(z.min()), float(np.hypot(x, y).max()) + lean)
+        for x, y, z in map(np.transpose, outlines)
+    )
     for bottom, radius in sorted(found):
         if not parts or radius > parts[-1].radius + _ALIKE:
             parts.append(Part(bottom, radius))
@@ -194,8 +238,11 @@ def _box(points: F64, axes: F64) -> Box:
 
 
 def fits(hand: HandShape, at: Sequence[float], yaw: float, layout: Layout) -> bool:
-    """Return whether a downward hand, `ee` at a place (3,) [m] and a yaw [rad], is clear of a layout's obstacles."""
-    axes = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])  # the hand's x and y
+    """Return whether a downward hand, `ee` at a place (3,) [m] and a yaw [rad], is clear of a
+    layout's obstacles.
+    """
+    # the hand's x and y
+    axes = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])
     for _, middle, half, height in layout.boxes:
         for box in hand.boxes:
             if at[2] + box.bottom > height + _BARELY:

@@ -1,7 +1,9 @@
-"""Carry: move the object to the goal past obstacles on the table, on the cheapest path for a reward.
+"""Carry: move the object to the goal past obstacles on the table, on the cheapest path for a
+reward.
 
-The path is planned for the object's centre, on a grid over the free space of the episode's layout. The reward's weights
-are part of the state, as positions of invisible mocap bodies, so that a label is a function of the state.
+The path is planned for the object's centre, on a grid over the free space of the episode's layout.
+The reward's weights are part of the state, as positions of invisible mocap bodies, so that a label
+is a function of the state.
 """
 
 import math
@@ -22,7 +24,16 @@ from manip_il.sim.shape import CUBE, ObjectShape
 from manip_il.sim.task import Observed, Rung, Start, Target
 from manip_il.sim.world import GOAL, Scene, World
 from manip_il.tasks.carry.grid import Descent, descent
-from manip_il.tasks.carry.layout import ABOVE, ASIDE, DEFAULT, FULL, OBSTACLES, TASTES, Layout, Reward
+from manip_il.tasks.carry.layout import (
+    ABOVE,
+    ASIDE,
+    DEFAULT,
+    FULL,
+    OBSTACLES,
+    TASTES,
+    Layout,
+    Reward,
+)
 from manip_il.tasks.carry.obstacles import (
     EDGE,
     PARKED,
@@ -37,7 +48,15 @@ from manip_il.tasks.carry.obstacles import (
     scale_of,
 )
 from manip_il.tasks.grasp import grasp_of, once_per_state
-from manip_il.tasks.ladder import AT_GOAL, CLOSED, approach, grasp_progress, grasp_rungs, is_held, nearness
+from manip_il.tasks.ladder import (
+    AT_GOAL,
+    CLOSED,
+    approach,
+    grasp_progress,
+    grasp_rungs,
+    is_held,
+    nearness,
+)
 from manip_il.tasks.pick_place import OBJECT, PickPlace
 from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying, draw_xy, turn_left
 
@@ -45,15 +64,20 @@ NAME = "carry"
 APART = 0.22  # least sideways distance of the goal from the object at the start, at full scale [m]
 HIGHEST = 0.2  # greatest height of a goal over the object's resting height, at full scale [m]
 STEP = 0.05  # how far ahead of the hand its target runs while it carries [m]
-OVER, STEEP = 0.012, 8.0  # misalignment up to which an empty hand may be down beside obstacles [m]; slope beyond
-_DRAWS, _TOO_MANY = 4_000, 80  # draws of a start, and draws after which one more obstacle is left out
+# misalignment up to which an empty hand may be down beside obstacles [m]; slope beyond
+OVER, STEEP = 0.012, 8.0
+# draws of a start, and draws after which one more obstacle is left out
+_DRAWS, _TOO_MANY = 4_000, 80
 _GRASPED = 0.5  # progress of an object that is held
 SPARE = 0.008  # extra clearance at the start and at the goal [m]
 GAP = 0.02  # least gap between two obstacles, at full scale [m]
-BETWEEN, OFF = 0.8, 0.05  # share of obstacles near the line from start to goal; standard deviation from it [m]
-FROM_EDGE = (0.045, 0.09)  # range of distances from the table's edge to the nearer of start and goal [m]
+# share of obstacles near the line from start to goal; standard deviation from it [m]
+BETWEEN, OFF = 0.8, 0.05
+# range of distances from the table's edge to the nearer of start and goal [m]
+FROM_EDGE = (0.045, 0.09)
 TRIES = 40  # draws of an obstacle's place before the layout is drawn again
-_SIDES = ((1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # sides that the edge may be on: away from the robot, left, right
+# sides that the edge may be on: away from the robot, left, right
+_SIDES = ((1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
 def descent_of(world: World) -> Descent:
@@ -83,12 +107,16 @@ def _to_goal(world: World) -> Target:
 
 
 def _rise(world: World) -> float:
-    """Least height of the hand over the grasp [m]; it grows with misalignment until the hand clears every obstacle."""
+    """Least height of the hand over the grasp [m].
+
+    It grows with misalignment until the hand clears every obstacle.
+    """
     layout, g = layout_of(world, OBJECT), grasp_of(world, OBJECT)
     if not layout.boxes:
         return 0.0
     tallest = max(height for _, _, _, height in layout.boxes)
-    safe = tallest + ABOVE - min(part.bottom for part in layout.parts[1:])  # height at which an open hand clears all
+    # height at which an open hand clears all
+    safe = tallest + ABOVE - min(part.bottom for part in layout.parts[1:])
     return min(STEEP * max(0.0, g.off - OVER), max(0.0, safe - g.at[2]))
 
 
@@ -99,7 +127,8 @@ def _approach(world: World, name: str, hover: float) -> Target:
 
 @dataclass(frozen=True)
 class Carry(PickPlace):
-    """Carry the object's centre to the goal past the obstacles on the table, as cheaply as possible for a reward.
+    """Carry the object's centre to the goal past the obstacles on the table, as cheaply as possible
+    for a reward.
 
     reward: written into the state at every start; the expert reads it from there.
     """
@@ -121,9 +150,16 @@ class Carry(PickPlace):
         return replace(super().with_shape(shape), horizon=200 if shape == CUBE else 300)
 
     def with_argument(self, text: NameOrPath) -> Self:
-        """Return the task with the reward that a text or a file describes; its name lists the nonzero weights."""
+        """Return the task with the reward that a text or a file describes.
+
+        Its name lists the nonzero weights.
+        """
         reward = Reward.parse(text)
-        return replace(self, name=NAME if reward == TASTES[DEFAULT] else f"{NAME}:{reward.numbers}", reward=reward)
+        return replace(
+            self,
+            name=NAME if reward == TASTES[DEFAULT] else f"{NAME}:{reward.numbers}",
+            reward=reward,
+        )
 
     def fitted(self, robot: Robot) -> Self:
         """Return the task with obstacles scaled to a robot's workspace."""
@@ -135,7 +171,10 @@ class Carry(PickPlace):
         add_obstacles(spec, self.scale)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the object, the goal and one to four obstacles, mostly between object and goal; store the reward."""
+        """Draw the object, the goal and one to four obstacles, mostly between object and goal.
+
+        Store the reward.
+        """
         names = rng.permutation([*OBSTACLES, EDGE]).tolist()
         names = names[: int(rng.integers(1, len(names) + 1))]
         for tried in range(_DRAWS):
@@ -149,16 +188,20 @@ class Carry(PickPlace):
                 tastes = {name: (three, UPRIGHT) for name, three in weights}
                 return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT), **obstacles, **tastes})
         raise UsageError(
-            f"task {self.name}: none of {_DRAWS:,} layouts drawn fits within reach of {world.robot.name};"
-            " choose another task or robot"
+            f"task {self.name}: none of {_DRAWS:,} layouts drawn fits within reach of"
+            f" {world.robot.name}; choose another task or robot"
         )
 
     def observe(self, world: World) -> Observed:
-        """Return what `pick_place` observes, and every obstacle's position and presence, but not the reward."""
+        """Return what `pick_place` observes, and every obstacle's position and presence, but not
+        the reward.
+        """
         return {**super().observe(world), **observe_obstacles(world)}
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label (obstacles overlap, no room for the hand, no path to the goal), or ""."""
+        """Return why there is no sound label (obstacles overlap, no room for the hand, no path
+        to the goal), or "".
+        """
         layout, at = layout_of(world, OBJECT), world.at(OBJECT)
         if layout.meeting:
             return "two obstacles overlap"
@@ -166,12 +209,16 @@ class Carry(PickPlace):
             leads = _at_goal(world) or _look(world)[1] is not None
         else:
             g, leads = grasp_of(world, OBJECT), descent_of(world).leads(at)
-            if layout.room(at[None])[0] < -ASIDE and not fits(hand_of(world.scene), g.at, g.yaw, layout):
+            if layout.room(at[None])[0] < -ASIDE and not fits(
+                hand_of(world.scene), g.at, g.yaw, layout
+            ):
                 return "no room for the hand beside an obstacle"
         return "" if leads else "no free path to the goal"
 
     def progress(self, world: World) -> float:
-        """Return progress by distance to the grasp, then by cost-to-go divided by the cost of a metre at the goal."""
+        """Return progress by distance to the grasp, then by cost-to-go divided by the cost of a
+        metre at the goal.
+        """
         if not is_held(world, OBJECT):
             return 0.9 * _GRASPED * grasp_progress(world, OBJECT, rise=_rise(world))
         if _at_goal(world):
@@ -190,11 +237,17 @@ def _draw_goal(rng: np.random.Generator, world: World, at: F64) -> F64:
 
 
 def _has_way(world: World, at: F64, goal: F64) -> bool:
-    """Whether a goal is far enough from the object, and the hand can carry the object there over any obstacles."""
+    """Whether a goal is far enough from the object, and the hand can carry the object there over
+    any obstacles.
+    """
     scale = scale_of(world.scene)
     if math.dist(at[:2], goal[:2]) < APART * scale or not world.reach.has(goal):
         return False
-    height = scale * max(one.height for one in OBSTACLES.values()) + max(world.extents(OBJECT)) / 2 + 2 * ABOVE
+    height = (
+        scale * max(one.height for one in OBSTACLES.values())
+        + max(world.extents(OBJECT)) / 2
+        + 2 * ABOVE
+    )
     over = [np.append(place[:2], max(height, goal[2])) for place in (at, goal)]
     lines = [np.linspace(start, end, 12) for start, end in pairwise((at, *over, goal))]
     return bool(world.reach.has_each(np.concatenate(lines, dtype=np.float64)).all())
@@ -203,7 +256,8 @@ def _has_way(world: World, at: F64, goal: F64) -> bool:
 def _draw_obstacles(
     rng: np.random.Generator, world: World, here: Sequence[str], at: F64, goal: F64
 ) -> dict[str, tuple[F64, F64]]:
-    """Draw the places of the obstacles in `here`, clear of the object's place `at` (3,) and its goal (3,) [m].
+    """Draw the places of the obstacles in `here`, clear of the object's place `at` (3,) and its
+    goal (3,) [m].
 
     Return the poses of all obstacles and the edge, or an empty dict if they do not fit.
     """
@@ -216,7 +270,8 @@ def _draw_obstacles(
         poses[EDGE] = edge[0], turn_left(math.atan2(edge[1][1], edge[1][0]))
     places: dict[str, F64] = {}
     for name in (name for name in OBSTACLES if name in here):
-        nearest = x - scene.robot.workspace.half_width + scale_of(scene) * OBSTACLES[name].half[0]  # towards the robot
+        # towards the robot
+        nearest = x - scene.robot.workspace.half_width + scale_of(scene) * OBSTACLES[name].half[0]
         for _ in range(TRIES):
             places[name] = _draw_place(rng, scene, at, goal)
             layout = make_layout(scene, lengths, goal, places, edge)
@@ -228,7 +283,9 @@ def _draw_obstacles(
 
 
 def _draw_edge(rng: np.random.Generator, scene: Scene, at: F64, goal: F64) -> tuple[F64, F64]:
-    """Draw a point on the table's edge and the direction away from the table, (3,) each, clear of start and goal."""
+    """Draw a point on the table's edge and the direction away from the table, (3,) each, clear
+    of start and goal.
+    """
     scale, middle = scale_of(scene), np.array([*scene.robot.workspace.centre, 0.0])
     outwards = np.array([*_SIDES[rng.integers(len(_SIDES))], 0.0])
     farthest = max(float((one - middle) @ outwards) for one in (at, goal))
@@ -246,7 +303,9 @@ def _draw_place(rng: np.random.Generator, scene: Scene, at: F64, goal: F64) -> F
 
 
 def _leaves_room(layout: Layout, home: F64, at: F64) -> bool:
-    """Whether the last obstacle is clear of start, goal and the hand's home, of other obstacles, and of the edge."""
+    """Whether the last obstacle is clear of start, goal and the hand's home, of other obstacles,
+    and of the edge.
+    """
     ends = np.array([at, layout.goal, [*home[:2], max(home[2], layout.half)]])
     if layout.room(ends).min() < SPARE:
         return False

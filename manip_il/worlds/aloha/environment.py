@@ -23,17 +23,26 @@ from manip_il.worlds.packaged import WHOLE, PackagedEnv, coordinates
 
 ALOHA_TASKS = {one.TASK.name: one.TASK for one in (transfer, insertion)}
 _JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
-ALOHA_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)  # as in `lerobot/aloha_sim_*`
-INSTALL = "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10 lxml==6.1.3"
+# as in `lerobot/aloha_sim_*`
+ALOHA_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)
+INSTALL = (
+    "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10"
+    " lxml==6.1.3"
+)
 MOST_REWARD = 4
 GRIPPERS = np.array(GRIPPERS_OF[TWO_ARMS])
 LONGEST = 0.04  # longest step of a joint, as for the expert [rad]
 _DEEP = 4e-3  # tolerated overlap in a redrawn scene [m]
-_ANEW = 0.6  # chance that an untouched object gets a new place; otherwise a hand reaching for it stays near it
-_DROPPED, _FALL = 0.1, 30  # chance that a hand drops what it carries; most control steps after it has opened
-_STAYS, _ELSEWHERE = 0.4, 0.08  # chance that an arm stays; largest standard deviation of its joints if not [rad]
-_COARSE = 240  # picture height up to which meshes are simplified [pixels]; 2 % of pixels change by over 8 of 255
-_CELL, _SHADOWS = 0.004, 1024  # least cell size of simplified meshes [m]; size of the shadow map [pixels]
+# chance that an untouched object gets a new place; otherwise a hand reaching for it stays near it
+_ANEW = 0.6
+# chance that a hand drops what it carries; most control steps after it has opened
+_DROPPED, _FALL = 0.1, 30
+# chance that an arm stays; largest standard deviation of its joints if not [rad]
+_STAYS, _ELSEWHERE = 0.4, 0.08
+# picture height up to which meshes are simplified [pixels]; 2 % of pixels change by over 8 of 255
+_COARSE = 240
+# least cell size of simplified meshes [m]; size of the shadow map [pixels]
+_CELL, _SHADOWS = 0.004, 1024
 _BLANK = np.zeros((1, 1, 3), np.uint8)
 
 
@@ -54,7 +63,8 @@ class AlohaEnv(PackagedEnv):
     """
 
     robot, action_meaning = "aloha", TWO_ARMS
-    control_hz, horizon = 50, 400  # as in LeRobot's environment; the one registered with gymnasium has 300 steps
+    # as in LeRobot's environment; the one registered with gymnasium has 300 steps
+    control_hz, horizon = 50, 400
     can = ("restored", "redrawn", "drawn")
     ends_solved = True
 
@@ -63,7 +73,8 @@ class AlohaEnv(PackagedEnv):
         self._env = _gym_aloha().AlohaEnv(self.task.own, obs_type="pixels_agent_pos")
         self.physics = self._env._env.physics
         self.draw = self.physics.render
-        self.physics.render = lambda **_: _BLANK  # it would draw three pictures in every step, whatever is observed
+        # it would draw three pictures in every step, whatever is observed
+        self.physics.render = lambda **_: _BLANK
         self.model, self.data = self.physics.model.ptr, self.physics.data.ptr
         self.actions = _actions(self.model)
         self.start(0)
@@ -89,11 +100,17 @@ class AlohaEnv(PackagedEnv):
     @override
     def observed_names(self) -> tuple[str, ...]:
         found = self.scene().observed().items()
-        return tuple(one for name, value in found for one in (coordinates(name) if np.ndim(value) else (name,)))
+        return tuple(
+            one
+            for name, value in found
+            for one in (coordinates(name) if np.ndim(value) else (name,))
+        )
 
     @override
     def observe(self) -> Observation:
-        """Return joint positions and gripper openings, (14,), the scene's `environment_state`, (k,), and pictures."""
+        """Return joint positions and gripper openings, (14,), the scene's `environment_state`,
+        (k,), and pictures.
+        """
         numbers = np.hstack([*self.scene().observed().values()])
         pictures = self._pictures(self._cameras) if self._cameras else {}
         return Observation(self.measured().astype(np.float32), numbers.astype(np.float32), pictures)
@@ -106,7 +123,9 @@ class AlohaEnv(PackagedEnv):
 
     @override
     def positions(self) -> dict[str, F64]:
-        """Return the positions (3,) [m] of the right hand and the objects, the first of which is `object`."""
+        """Return the positions (3,) [m] of the right hand and the objects, the first of which is
+        `object`.
+        """
         scene = self.scene()
         names = ["object", *list(scene.things)[1:]]
         things = zip(names, scene.things.values(), strict=True)
@@ -116,7 +135,8 @@ class AlohaEnv(PackagedEnv):
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
         """Return `state` with some arms and some untouched objects on the table moved at random.
 
-        An object in a hand moves with the hand, or is dropped first. Return None if bodies then overlap.
+        An object in a hand moves with the hand, or is dropped first. Return None if bodies then
+        overlap.
         """
         self.set_state(state)
         self._env.reset(seed=int(rng.integers(2**32)))
@@ -125,7 +145,10 @@ class AlohaEnv(PackagedEnv):
         if rng.random() < 2 * _DROPPED:
             self._drop(rng)
         scene = self.scene()
-        holders = {name: [side for side in scene.hands if any(scene.touches(side, name))] for name in self.task.objects}
+        holders = {
+            name: [side for side in scene.hands if any(scene.touches(side, name))]
+            for name in self.task.objects
+        }
         for name, sides in holders.items():
             if not sides and scene.on_table(name) and rng.random() < _ANEW:
                 at, speed = self._free(name)
@@ -133,15 +156,21 @@ class AlohaEnv(PackagedEnv):
                 self.data.qvel[speed : speed + 6] = 0
         for number, (side, hand) in enumerate(scene.hands.items()):
             held = [name for name, sides in holders.items() if side in sides]
-            if rng.random() < _STAYS or any(len(holders[name]) > 1 or scene.on_table(name) for name in held):
+            if rng.random() < _STAYS or any(
+                len(holders[name]) > 1 or scene.on_table(name) for name in held
+            ):
                 continue
-            self.data.qpos[8 * number : 8 * number + 6] += rng.normal(0.0, _ELSEWHERE * rng.uniform() ** 2, 6)
+            self.data.qpos[8 * number : 8 * number + 6] += rng.normal(
+                0.0, _ELSEWHERE * rng.uniform() ** 2, 6
+            )
             mujoco.mj_kinematics(self.model, self.data)
             moved = read_hand(side, number, self.data)
             turn = moved.rotation @ hand.rotation.T
             for name in held:
                 at, _ = self._free(name)
-                self.data.qpos[at : at + 3] = moved.position + turn @ (scene.things[name].position - hand.position)
+                self.data.qpos[at : at + 3] = moved.position + turn @ (
+                    scene.things[name].position - hand.position
+                )
                 quat = np.empty(4)
                 mujoco.mju_mat2Quat(quat, (turn @ scene.things[name].axes).ravel())
                 self.data.qpos[at + 3 : at + 7] = quat
@@ -151,10 +180,16 @@ class AlohaEnv(PackagedEnv):
         return replace(state, physics=self._physics())
 
     def _drop(self, rng: np.random.Generator) -> None:
-        """Pick a hand; if it holds something in the air, open it and simulate some control steps."""
+        """Pick a hand.
+
+        If it holds something in the air, open it and simulate some control steps.
+        """
         scene, number = self.scene(), int(rng.integers(2))
         hand = list(scene.hands)[number]
-        if any(all(scene.touches(hand, name)) and not scene.on_table(name) for name in self.task.objects):
+        if any(
+            all(scene.touches(hand, name)) and not scene.on_table(name)
+            for name in self.task.objects
+        ):
             action = self.measured()
             action[GRIPPERS[number]] = 1.0
             for _ in range(rng.integers(1, _FALL)):
@@ -170,16 +205,21 @@ class AlohaEnv(PackagedEnv):
         painter = _painter(self.task.name, fine=height > _COARSE)
         painter.set_state(self.get_state())
         try:
-            return {name: painter.draw(height=height, width=width, camera_id=name) for name in cameras.names}
+            return {
+                name: painter.draw(height=height, width=width, camera_id=name)
+                for name in cameras.names
+            }
         except Exception as error:  # what OpenGL and its bindings raise
             raise RenderError(f"{self.robot} cannot be rendered ({error}); {REMEDY}") from error
 
 
 @cached_per_thread()
 def _painter(task: str, *, fine: bool) -> AlohaEnv:
-    """The environment that draws a task's states in this thread, so that one OpenGL context is enough.
+    """The environment that draws a task's states in this thread, so that one OpenGL context is
+    enough.
 
-    Unless `fine`, its meshes have fewer faces and its shadows are coarser, which is 3.5 times faster in software.
+    Unless `fine`, its meshes have fewer faces and its shadows are coarser, which is 3.5 times
+    faster in software.
     """
     painter = AlohaEnv(task)
     if not fine:
@@ -192,11 +232,16 @@ def _gym_aloha() -> Any:
     try:
         return import_module("gym_aloha.env")
     except ModuleNotFoundError as error:
-        raise ManipError(f"{AlohaEnv.robot} needs {error.name}, which is not installed: {INSTALL}") from error
+        raise ManipError(
+            f"{AlohaEnv.robot} needs {error.name}, which is not installed: {INSTALL}"
+        ) from error
 
 
 def _actions(model: mujoco.MjModel) -> ActionSpace:
-    """Actions within the actuators' own bounds, which MuJoCo enforces; the environment's -1 to 1 does not apply."""
+    """Actions within the actuators' own bounds, which MuJoCo enforces.
+
+    The environment's -1 to 1 does not apply.
+    """
     chosen = [*range(7), *range(8, 15)]  # a hand's right finger mirrors the left one
     low, high = model.actuator_ctrlrange[chosen].T.copy()
     low[GRIPPERS], high[GRIPPERS] = 0.0, 1.0

@@ -16,7 +16,8 @@ from manip_il.worlds.contract import Environment, Expert
 from manip_il.worlds.packaged import Packaged
 
 ORIENTATION, POSTURE = 0.3, 0.003  # costs [1/rad], relative to 1 [1/m] for the position
-ROLL, STRAIGHT = 0.15, (0.15, 0.35)  # forearm roll's cost at a straight wrist; peak's width, wrist up and down [rad]
+# forearm roll's cost at a straight wrist; peak's width, wrist up and down [rad]
+ROLL, STRAIGHT = 0.15, (0.15, 0.35)
 FOREARM_ROLL, WRIST = 3, 4
 MOST_STEP, MOST_TURN = 0.10, 0.5  # largest step of a hand towards its target [m], [rad]
 FALLEN = -0.02  # an object lower than this has fallen off the table [m]
@@ -40,7 +41,9 @@ class AlohaExpert(Expert):
         scene = env.scene()
         if reason := self._unsound(scene):
             return self._still(reason)
-        rungs = {side: next(rung for rung in env.task.rungs[side] if rung.holds(scene)) for side in SIDES}
+        rungs = {
+            side: next(rung for rung in env.task.rungs[side] if rung.holds(scene)) for side in SIDES
+        }
         action = np.empty(len(env.actions))
         for number, (side, rung) in enumerate(rungs.items()):
             target = rung.target(scene)
@@ -65,7 +68,9 @@ class AlohaExpert(Expert):
 
     def _still(self, reason: str) -> Label:
         actions = self._env.actions
-        return Label(np.clip(self._env.measured(), actions.low, actions.high), 0, False, 1.0, reason)
+        return Label(
+            np.clip(self._env.measured(), actions.low, actions.high), 0, False, 1.0, reason
+        )
 
 
 class _Arm:
@@ -79,13 +84,25 @@ class _Arm:
         home = np.array(constants.START_ARM_POSE[:6])
         self._ik = PoseProgram(_alone(side), f"cali_{side}_site1", home, (ORIENTATION, POSTURE))
         self._gain = model.actuator_gainprm[joints, 0]
-        self._breakaway = model.dof_frictionloss[joints] / self._gain  # lead at which a joint overcomes friction [rad]
-        # Below it joints creep, because MuJoCo's friction is soft: an impedance of 0.9 within 0.02 s.
-        softness = self._gain * model.dof_invweight0[joints] * (0.1 / 0.9) * (CREEPS * constants.DT) / 2 * constants.DT
+        # lead at which a joint overcomes friction [rad]
+        self._breakaway = model.dof_frictionloss[joints] / self._gain
+        # Below it joints creep, because MuJoCo's friction is soft: an impedance of 0.9 within 0.02
+        # s.
+        softness = (
+            self._gain
+            * model.dof_invweight0[joints]
+            * (0.1 / 0.9)
+            * (CREEPS * constants.DT)
+            / 2
+            * constants.DT
+        )
         self._creep = 1 - np.exp(-softness)  # step per lead [rad/rad]
 
     def command(self, hand: Hand, target: HandTarget) -> F64 | None:
-        """Return joint targets (6,) [rad] one step towards a target; None if there is no solution."""
+        """Return joint targets (6,) [rad] one step towards a target.
+
+        None if there is no solution.
+        """
         way = target.position - hand.position
         length = float(np.linalg.norm(way))
         position = hand.position + way * min(1.0, MOST_STEP / max(length, MOST_STEP))
@@ -100,14 +117,20 @@ class _Arm:
         return hand.q + self._lead(step) + gravity
 
     def _lead(self, step: F64) -> F64:
-        """Lead of joint targets over joints, (6,) [rad], that moves the joints by `step` (6,) despite friction."""
+        """Lead of joint targets over joints, (6,) [rad], that moves the joints by `step` (6,)
+        despite friction.
+        """
         size, most = np.abs(step), CREEPS * self._breakaway
         crept = self._creep * most
-        return np.sign(step) * np.where(size <= crept, size / self._creep, most + (size - crept) / BREAKAWAY)
+        return np.sign(step) * np.where(
+            size <= crept, size / self._creep, most + (size - crept) / BREAKAWAY
+        )
 
 
 def _posture_costs(q: F64) -> F64:
-    """Costs of the posture, (6,) [1/rad]: they keep the forearm from winding around if the wrist is straight."""
+    """Costs of the posture, (6,) [1/rad]: they keep the forearm from winding around if the wrist
+    is straight.
+    """
     costs = np.full(len(q), POSTURE)
     straight = math.exp(-((q[WRIST] / STRAIGHT[int(q[WRIST] <= 0)]) ** 2))
     costs[FOREARM_ROLL] = math.hypot(POSTURE, ROLL * straight)

@@ -1,4 +1,7 @@
-"""The left hand takes the socket and the right one the peg; they meet in the air, and the peg goes in."""
+"""The left hand takes the socket and the right one the peg.
+
+They meet in the air, and the peg goes in.
+"""
 
 import math
 from functools import cached_property
@@ -27,9 +30,12 @@ PEG, SOCKET = "peg", "socket"
 OF = {"left": SOCKET, "right": PEG}
 MEETING = np.array([-0.06, 0.5, 0.10])  # position of the socket for the insertion [m]
 WAITING = np.array([0.17, 0.0, 0.0])  # offset of the waiting peg from `MEETING` [m]
-AT_MEETING, LEVEL = 0.03, 0.2  # largest errors of the socket's position and rotation for the peg to come [m], [rad]
-BEFORE, DEEP = 0.135, 0.085  # place of the peg along the socket's axis: outside, inside; it meets the pin at 0.10 [m]
-SLOPE, TOLERANCE = 8.0, 0.003  # funnel: retreat per sideways error of the peg, and tolerated error [m]
+# largest errors of the socket's position and rotation for the peg to come [m], [rad]
+AT_MEETING, LEVEL = 0.03, 0.2
+# place of the peg along the socket's axis: outside, inside; it meets the pin at 0.10 [m]
+BEFORE, DEEP = 0.135, 0.085
+# funnel: retreat per sideways error of the peg, and tolerated error [m]
+SLOPE, TOLERANCE = 8.0, 0.003
 ADVANCE = 0.05  # largest advance of the peg in a step [m]
 LOW, HIGH = 0.015, 0.055  # heights between which a lifted object begins to move sideways [m]
 INSERTED = 0.03  # longest step of a joint while the peg is aligned and inserted [rad]
@@ -64,11 +70,15 @@ class Insertion(AlohaScene):
 
     @cached_property
     def depth(self) -> float:
-        """Next position of the peg along the socket's axis: straight in, or back if it is misaligned [m]."""
+        """Next position of the peg along the socket's axis: straight in, or back if it is
+        misaligned [m].
+        """
         peg, socket = self.things[PEG], self.things[SOCKET]
         frame = socket.frame
         off = frame.T @ (peg.position - socket.position)
-        aside = math.hypot(off[1], off[2]) + ARM * math.acos(min(1.0, float(frame[:, 0] @ peg.frame[:, 0])))
+        aside = math.hypot(off[1], off[2]) + ARM * math.acos(
+            min(1.0, float(frame[:, 0] @ peg.frame[:, 0]))
+        )
         back = min(BEFORE, DEEP + SLOPE * max(0.0, aside - TOLERANCE))
         return max(back, off[0] - ADVANCE)
 
@@ -91,13 +101,17 @@ def _carry(side: str, to: F64) -> PackagedRung:
 def _insert(scene: Insertion) -> HandTarget:
     socket = scene.things[SOCKET]
     frame = socket.frame
-    return move_object(scene, "right", PEG, socket.position + scene.depth * frame[:, 0], frame, INSERTED)
+    return move_object(
+        scene, "right", PEG, socket.position + scene.depth * frame[:, 0], frame, INSERTED
+    )
 
 
 _RUNGS = {
     "left": (_carry("left", MEETING), *take_rungs("left", SOCKET, lambda one: one.grasps["left"])),
     "right": (
-        PackagedRung("insert", lambda one: one.has["right"] and one.ready and one.depth < BEFORE, _insert),
+        PackagedRung(
+            "insert", lambda one: one.has["right"] and one.ready and one.depth < BEFORE, _insert
+        ),
         PackagedRung("align", lambda one: one.has["right"] and one.ready, _insert),
         _carry("right", MEETING + WAITING),
         *take_rungs("right", PEG, lambda one: one.grasps["right"]),

@@ -18,7 +18,8 @@ from manip_il.worlds.packaged import PackagedRung, always
 SIDES = ("left", "right")
 FINGER_AT_TOUCH = 0.0224  # position of a finger joint at which the fingers would touch [m]
 GRASP_AHEAD = -0.002  # offset of a held object from the hand's site along the fingers [m]
-AROUND = (0.010, 0.012, 0.010)  # largest offset from that place to begin closing, in the hand's axes [m]
+# largest offset from that place to begin closing, in the hand's axes [m]
+AROUND = (0.010, 0.012, 0.010)
 HELD_AROUND = (0.020, 0.022, 0.020)  # the same while closing or holding [m]
 ANGLE, HELD_ANGLE = 0.25, 0.6  # largest angles to the grasp's rotation, to begin and to hold [rad]
 LIFTED = 0.04  # height of an object that has left the table [m]
@@ -29,7 +30,8 @@ OPEN, CLOSED = 1.0, 0.0
 FAST = 0.04  # longest step of a joint [rad]
 PITCH = math.radians(60)  # downward pitch of a hand that takes something from the table
 STANDOFF = 0.09  # distance from an object at which the hand starts its final approach [m]
-SLOPE, TOLERANCE = 2.0, 0.006  # funnel: retreat per sideways error of the hand, and tolerated error [m]
+# funnel: retreat per sideways error of the hand, and tolerated error [m]
+SLOPE, TOLERANCE = 2.0, 0.006
 ARM = 0.06  # sideways error that a radian counts as [m/rad]
 OPENING_STANDOFF = 0.045  # distance from an object while the fingers are not open [m]
 OPENING_SPAN = 0.004  # range of half the gap over which that distance falls to 0 [m]
@@ -39,7 +41,9 @@ MOST_TURN = 0.3  # largest turn of an object in a step [rad]
 
 @dataclass(frozen=True)
 class Held:
-    """Half gaps between the fingers for one object [m]. open: smallest that clears it; thin: smallest that holds it.
+    """Half gaps between the fingers for one object [m]. open: smallest that clears it.
+
+    thin: smallest that holds it.
 
     long: whether the object is longest along its own x axis.
     """
@@ -51,9 +55,11 @@ class Held:
 
 @dataclass(frozen=True)
 class Hand:
-    """One hand: its position (3,) [m], axes (ahead, across, up) (3, 3), and half the gap between its fingers [m].
+    """One hand: its position (3,) [m], axes (ahead, across, up) (3, 3), and half the gap between
+    its fingers [m].
 
-    q: joints of its arm, (6,) [rad]. outward: its across axis, (3,), if the arm reaches straight to the table's middle.
+    q: joints of its arm, (6,) [rad]. outward: its across axis, (3,), if the arm reaches straight to
+    the table's middle.
     """
 
     position: F64
@@ -94,8 +100,8 @@ class Thing:
 class AlohaTask:
     """One task of `gym_aloha`. own: its name there. grasped: the hand that takes each object.
 
-    scene: the facts that its rungs read; rungs: those of each hand, latest first. inserted: an object, and the object
-    that it goes into; empty if nothing is inserted.
+    scene: the facts that its rungs read; rungs: those of each hand, latest first. inserted: an
+    object, and the object that it goes into; empty if nothing is inserted.
     """
 
     name: str
@@ -115,7 +121,10 @@ class AlohaTask:
 
 
 class AlohaScene:
-    """Hands, objects and contacts in one state. A task's own subclass adds the facts that its rungs need."""
+    """Hands, objects and contacts in one state.
+
+    A task's own subclass adds the facts that its rungs need.
+    """
 
     def __init__(self, task: AlohaTask, model: mujoco.MjModel, data: mujoco.MjData):
         self.task, self._model = task, model
@@ -143,17 +152,22 @@ class AlohaScene:
         return any({*pair} == arms for pair in self._model.body_rootid[self._touching].tolist())
 
     def holds(self, side: str, name: str) -> bool:
-        """Return whether a hand has an object between its fingers: both touch it, or it is already in the air.
+        """Return whether a hand has an object between its fingers: both touch it, or it is already
+        in the air.
 
         In the air a brief loss of contact does not matter, as the fingers keep closing.
         """
         hand, thing = self.hands[side], self.things[name]
         if not _within(hand.sees(thing.position), HELD_AROUND) or hand.gap < thing.about.thin:
             return False
-        return all(self.touches(side, name)) or (thing.position[2] > LIFTED and hand.gap < thing.about.open + SLACK)
+        return all(self.touches(side, name)) or (
+            thing.position[2] > LIFTED and hand.gap < thing.about.open + SLACK
+        )
 
     def is_at_grasp(self, side: str, name: str, rotation: F64) -> bool:
-        """Return whether a hand may close, or keep closing, on an object. rotation: the grasp's, (3, 3)."""
+        """Return whether a hand may close, or keep closing, on an object. rotation: the grasp's,
+        (3, 3).
+        """
         hand, thing = self.hands[side], self.things[name]
         if hand.gap < thing.about.thin:  # closed beside it: open again
             return False
@@ -163,7 +177,9 @@ class AlohaScene:
         return _within(off, AROUND) and angle < ANGLE
 
     def observed(self) -> dict[str, F64]:
-        """Return the entries of `environment_state` by name: lengths [m], columns of rotations, contacts (0, 1)."""
+        """Return the entries of `environment_state` by name: lengths [m], columns of rotations,
+        contacts (0, 1).
+        """
         found = dict[str, Any]()
         for side, hand in self.hands.items():
             found[f"{side}_ee"] = hand.position
@@ -204,7 +220,9 @@ def nearest(axes: F64, way: F64) -> F64:
 
 
 def ahead_across(ahead: F64, across: F64) -> F64:
-    """Return the rotation (3, 3) of a hand that points along `ahead` (3,) and opens roughly along `across` (3,)."""
+    """Return the rotation (3, 3) of a hand that points along `ahead` (3,) and opens roughly
+    along `across` (3,).
+    """
     x = ahead / np.linalg.norm(ahead)
     y = across - x * (x @ across)
     y /= np.linalg.norm(y)
@@ -212,7 +230,9 @@ def ahead_across(ahead: F64, across: F64) -> F64:
 
 
 def pitched(across: F64, pitch: float) -> F64:
-    """Return the rotation (3, 3) of a hand pitched down [rad], its fingers opening along the level part of `across`."""
+    """Return the rotation (3, 3) of a hand pitched down [rad], its fingers opening along the
+    level part of `across`.
+    """
     level = np.array([across[0], across[1], 0.0])
     y = level / np.linalg.norm(level)
     return ahead_across(math.cos(pitch) * cross(y, Z) - math.sin(pitch) * Z, y)
@@ -231,7 +251,9 @@ def _within(off: F64, box: tuple[float, float, float]) -> bool:
 
 
 class HandTarget(NamedTuple):
-    """Target pose of a hand, (3,) [m] and (3, 3), its gripper's command, and the longest step of a joint [rad]."""
+    """Target pose of a hand, (3,) [m] and (3, 3), its gripper's command, and the longest step of
+    a joint [rad].
+    """
 
     position: F64
     rotation: F64
@@ -241,7 +263,9 @@ class HandTarget(NamedTuple):
 
 def close_on(scene: AlohaScene, name: str, rotation: F64, longest: float = FAST) -> HandTarget:
     """Close the fingers on the object. rotation: the grasp's, (3, 3)."""
-    return HandTarget(scene.things[name].position - GRASP_AHEAD * rotation[:, 0], rotation, CLOSED, longest)
+    return HandTarget(
+        scene.things[name].position - GRASP_AHEAD * rotation[:, 0], rotation, CLOSED, longest
+    )
 
 
 def approach(
@@ -263,18 +287,28 @@ def approach(
     return HandTarget(hand.position + way, rotation, OPEN, longest)
 
 
-def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[PackagedRung, PackagedRung]:
-    """Return the rungs of a hand that takes an object from the table. grasp: scene -> the hand's rotation, (3, 3)."""
+def take_rungs(
+    side: str, name: str, grasp: Callable[[Any], F64]
+) -> tuple[PackagedRung, PackagedRung]:
+    """Return the rungs of a hand that takes an object from the table. grasp: scene -> the hand's
+    rotation, (3, 3).
+    """
     return (
         PackagedRung(
-            "grasp", lambda one: one.is_at_grasp(side, name, grasp(one)), lambda one: close_on(one, name, grasp(one))
+            "grasp",
+            lambda one: one.is_at_grasp(side, name, grasp(one)),
+            lambda one: close_on(one, name, grasp(one)),
         ),
         PackagedRung("approach", always, lambda one: approach(one, side, name, grasp(one))),
     )
 
 
-def move_object(scene: AlohaScene, side: str, name: str, to: F64, frame: F64, longest: float) -> HandTarget:
+def move_object(
+    scene: AlohaScene, side: str, name: str, to: F64, frame: F64, longest: float
+) -> HandTarget:
     """Bring a held object to a place (3,) [m], and turn its `Thing.frame` to `frame` (3, 3)."""
     hand, thing = scene.hands[side], scene.things[name]
     turn = turned_towards(np.eye(3), frame @ thing.frame.T, MOST_TURN)
-    return HandTarget(to + turn @ (hand.position - thing.position), turn @ hand.rotation, CLOSED, longest)
+    return HandTarget(
+        to + turn @ (hand.position - thing.position), turn @ hand.rotation, CLOSED, longest
+    )

@@ -30,9 +30,11 @@ CUBE = "box"
 MEETING = np.array([0.0, 0.5, 0.25])  # position of the cube for the handover [m]
 WAITING = np.array([-0.12, 0.0, 0.0])  # offset of the waiting left hand from `MEETING` [m]
 NEAR = 0.1  # distance of the cube from `MEETING` at which the left hand sets out [m]
-KEPT_OFF, ARRIVED = 0.12, 0.02  # largest gap between left hand and cube; `to_go` at which it is 0 [m]
+# largest gap between left hand and cube; `to_go` at which it is 0 [m]
+KEPT_OFF, ARRIVED = 0.12, 0.02
 LEFT_CLOSED = 0.025  # half the gap below which the left fingers hold the cube [m]
-OPENED, OPENING = 0.022, 0.004  # half the gap at which the right hand leaves; range over which its step grows [m]
+# half the gap at which the right hand leaves; range over which its step grows [m]
+OPENED, OPENING = 0.022, 0.004
 CLEAR = 0.12  # final distance of the right hand from the cube [m]
 # longest joint steps: carrying, handing over, parting [rad]
 CARRIED = 0.02
@@ -57,7 +59,9 @@ class Transfer(AlohaScene):
 
     @cached_property
     def left_grasp(self) -> F64:
-        """Rotation of the left hand that takes the cube from the right one, fingers across the other's, (3, 3)."""
+        """Rotation of the left hand that takes the cube from the right one, fingers across the
+        other's, (3, 3).
+        """
         axes = self.things[CUBE].axes
         between = int(np.abs(self.right.rotation[:, 1] @ axes).argmax())
         free = np.delete(axes, between, axis=1)
@@ -91,12 +95,16 @@ def _let_go(scene: Transfer) -> HandTarget:
     hand = scene.right
     share = max(0.0, min(1.0, (hand.gap - OPENED) / OPENING))
     way = max(0.0, CLEAR - abs(hand.sees(scene.cube)[0]))
-    return HandTarget(hand.position - share * way * hand.rotation[:, 0], hand.rotation, OPEN, PARTING)
+    return HandTarget(
+        hand.position - share * way * hand.rotation[:, 0], hand.rotation, OPEN, PARTING
+    )
 
 
 def _carry(scene: Transfer) -> HandTarget:
     hand = scene.right
-    return HandTarget(hand.position + MEETING - scene.cube, pitched(hand.outward, PITCH), CLOSED, CARRIED)
+    return HandTarget(
+        hand.position + MEETING - scene.cube, pitched(hand.outward, PITCH), CLOSED, CARRIED
+    )
 
 
 def _come(scene: Transfer) -> HandTarget:
@@ -111,14 +119,18 @@ def _wait(scene: Transfer) -> HandTarget:
 _RUNGS = {
     "left": (
         PackagedRung(
-            "hold", lambda one: one.left_holds, lambda one: HandTarget(one.left.position, one.left.rotation, CLOSED)
+            "hold",
+            lambda one: one.left_holds,
+            lambda one: HandTarget(one.left.position, one.left.rotation, CLOSED),
         ),
         PackagedRung(
             "close",
             lambda one: one.lifted and one.is_at_grasp("left", CUBE, one.left_grasp),
             lambda one: close_on(one, CUBE, one.left_grasp, CARRIED),
         ),
-        PackagedRung("come", lambda one: one.right_holds and one.lifted and one.to_go < NEAR, _come),
+        PackagedRung(
+            "come", lambda one: one.right_holds and one.lifted and one.to_go < NEAR, _come
+        ),
         PackagedRung("wait", always, _wait),
     ),
     "right": (

@@ -22,7 +22,10 @@ STATE_NAMES = ("gripper.x", "gripper.y", "gripper.z", "gripper.opening")
 
 @dataclass(frozen=True)
 class FetchTask:
-    """A task of Fetch. has_object: the goal is for a cube, not for the gripper; blocked: the fingers stay closed."""
+    """A task of Fetch. has_object: the goal is for a cube, not for the gripper.
+
+    blocked: the fingers stay closed.
+    """
 
     name: str
     instruction: str
@@ -48,22 +51,28 @@ class FetchActions(ActionSpace):
 
 
 _ONES = np.ones(len(STATE_NAMES))
-ACTIONS = FetchActions(STATE_NAMES, -_ONES, _ONES, np.array([1.0, 1.0, 1.0, 2.0]), np.array([True, True, True, False]))
+ACTIONS = FetchActions(
+    STATE_NAMES, -_ONES, _ONES, np.array([1.0, 1.0, 1.0, 2.0]), np.array([True, True, True, False])
+)
 
 
 class FetchEnv(PackagedEnv):
     """An environment of gymnasium-robotics. task: the environment's name there."""
 
     robot = "fetch_stock"
-    action_meaning = "displacement of the gripper in x, y, z [5 cm], fingers from -1 (close) to 1 (open)"
+    action_meaning = (
+        "displacement of the gripper in x, y, z [5 cm], fingers from -1 (close) to 1 (open)"
+    )
     control_hz, horizon = 25, 50
     actions = ACTIONS
 
     def __init__(self, task: str, cameras: CameraConfig | None = None):
         self.task = FETCH_TASKS[task]
-        with contextlib.redirect_stderr(io.StringIO()):  # gymnasium-robotics announces its versions there
+        # gymnasium-robotics announces its versions there
+        with contextlib.redirect_stderr(io.StringIO()):
             import_module("gymnasium_robotics")  # which registers its names
-            self._env: Any = gymnasium.make(task, reward_type="sparse").unwrapped  # the horizon is its time limit
+            # the horizon is its time limit
+            self._env: Any = gymnasium.make(task, reward_type="sparse").unwrapped
         self.model = self._env.model
         self.data = self._env.data
         self._env._mujoco_step = self._run_physics
@@ -75,7 +84,12 @@ class FetchEnv(PackagedEnv):
         turning = ("object_turn", "object_velocity", "object_spin") if self.task.has_object else ()
         fingers = ("finger.right", "finger.left")
         speeds = [f"{name}.velocity" for name in fingers]
-        names = (*coordinates("ee", *things), *fingers, *coordinates(*turning, "ee_velocity"), *speeds)
+        names = (
+            *coordinates("ee", *things),
+            *fingers,
+            *coordinates(*turning, "ee_velocity"),
+            *speeds,
+        )
         return (*names, *coordinates("goal"))
 
     @override
@@ -86,7 +100,8 @@ class FetchEnv(PackagedEnv):
     @override
     def step(self, action: NDArray[Any]) -> Outcome:
         outcome = super().step(action)
-        if self.task.blocked:  # with closed fingers, the environment's step has recomputed all poses
+        # with closed fingers, the environment's step has recomputed all poses
+        if self.task.blocked:
             self._remember()
         return outcome
 
@@ -94,7 +109,9 @@ class FetchEnv(PackagedEnv):
     @override
     def progress(self) -> float:
         """Share of the task that is done: 1 within the tolerance, 0.5 at twice that distance."""
-        left = np.linalg.norm(self.positions()["object" if self.task.has_object else "hand"] - self.goal)
+        left = np.linalg.norm(
+            self.positions()["object" if self.task.has_object else "hand"] - self.goal
+        )
         return TOLERANCE / max(TOLERANCE, float(left))
 
     @property
@@ -115,7 +132,9 @@ class FetchEnv(PackagedEnv):
     @property
     def opening(self) -> float:
         """Distance between the fingers [m]."""
-        return sum(float(self.data.joint(f"robot0:{side}_gripper_finger_joint").qpos[0]) for side in "rl")
+        return sum(
+            float(self.data.joint(f"robot0:{side}_gripper_finger_joint").qpos[0]) for side in "rl"
+        )
 
     @property
     def goal(self) -> F64:
@@ -124,16 +143,22 @@ class FetchEnv(PackagedEnv):
 
     @override
     def observe(self) -> Observation:
-        """Return the gripper's position and opening, (4,) [m], and the environment's own observation and goal, (k,)."""
+        """Return the gripper's position and opening, (4,) [m], and the environment's own
+        observation and goal, (k,).
+        """
         own = self._env._get_obs()
         state = np.append(own["observation"][:3], self.opening).astype(np.float32)
-        return Observation(state, np.append(own["observation"], own["desired_goal"]).astype(np.float32))
+        return Observation(
+            state, np.append(own["observation"], own["desired_goal"]).astype(np.float32)
+        )
 
     @override
     def get_state(self) -> State:
         """Return MuJoCo's state, what the poses are computed from, and the goal as `variation`."""
         state = super().get_state()
-        return replace(state, physics=np.concatenate([state.physics, self._posed]), variation=self.goal.copy())
+        return replace(
+            state, physics=np.concatenate([state.physics, self._posed]), variation=self.goal.copy()
+        )
 
     @override
     def set_state(self, state: State) -> None:
@@ -157,7 +182,9 @@ class FetchEnv(PackagedEnv):
         self._posed = np.concatenate([self.data.qpos, self.data.qvel])
 
     def _run_physics(self, action: NDArray[Any]) -> None:
-        """Run the environment's physics steps in two calls, to store the state before the last one."""
+        """Run the environment's physics steps in two calls, to store the state before the last
+        one.
+        """
         mujoco.mj_step(self.model, self.data, nstep=self._env.n_substeps - 1)
         self._remember()
         mujoco.mj_step(self.model, self.data, nstep=1)

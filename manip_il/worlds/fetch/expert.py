@@ -1,8 +1,8 @@
 """Experts of Fetch: ladders over gripper, cube and goal, the task's last rung first.
 
-A rung reads the environment. Its target is the gripper's displacement, (3,) [m], and the fingers' command, -1 to 1. An
-action of 1 moves the gripper by about `REACH` in a control step along each axis independently, so that the longest of
-x, y and z determines how long a move takes.
+A rung reads the environment. Its target is the gripper's displacement, (3,) [m], and the fingers'
+command, -1 to 1. An action of 1 moves the gripper by about `REACH` in a control step along each
+axis independently, so that the longest of x, y and z determines how long a move takes.
 """
 
 import itertools
@@ -22,18 +22,24 @@ HALF = 0.025  # half the cube's edge length [m]
 # Pick and place; heights are the gripper's over the cube's middle
 GRASP_HEIGHT = 0.0145  # [m]
 CLEAR = 0.053  # height at which the fingers pass over the cube [m]
-STRADDLE = 0.042  # offset from the cube in y from which the gripper gets over it while descending [m]
-NEAR = np.array([0.082, 0.04, 0.082])  # distance that the gripper still covers while the fingers close [m]
+# offset from the cube in y from which the gripper gets over it while descending [m]
+STRADDLE = 0.042
+# distance that the gripper still covers while the fingers close [m]
+NEAR = np.array([0.082, 0.04, 0.082])
 OPENING = 0.25  # extra opening needed per distance of the cube in x, a ratio
 LEAD = 0.04  # largest lead of the gripper in y towards the goal while the fingers close [m]
 CLOSED_ON = 0.03  # distance to the grasp at which that lead begins [m]
-GRASPED = np.array([0.03, 0.026, 0.04])  # largest offset from the cube in x, y, z if the fingers hold it [m]
+# largest offset from the cube in x, y, z if the fingers hold it [m]
+GRASPED = np.array([0.03, 0.026, 0.04])
 HELD = 0.054  # opening below which the fingers hold the cube [m]
 
 # Push
-BOX = np.array([HALF + 0.0135, HALF + 0.0155])  # half sides of the area blocked to the gripper's middle by the cube [m]
-CORNERS = [np.array([x, y]) * (BOX + 0.01) for x in (-1, 1) for y in (-1, 1)]  # waypoints around it [m]
-LOW, HIGH = 0.012, 0.05  # heights of the gripper over the cube's middle, to push it and to pass over it [m]
+# half sides of the area blocked to the gripper's middle by the cube [m]
+BOX = np.array([HALF + 0.0135, HALF + 0.0155])
+# waypoints around it [m]
+CORNERS = [np.array([x, y]) * (BOX + 0.01) for x in (-1, 1) for y in (-1, 1)]
+# heights of the gripper over the cube's middle, to push it and to pass over it [m]
+LOW, HIGH = 0.012, 0.05
 AHEAD = 0.004  # gap between gripper and cube on arrival behind it [m]
 # offsets from the place behind the cube within which the gripper pushes [m]
 ALONG = 0.028
@@ -42,7 +48,8 @@ BELOW = 0.03
 LOOK = 0.003  # how far ahead the pushed cube's motion is predicted [s]
 DECELERATION = 9.0  # deceleration of a cube that slides on the table [m/s^2]
 AT_GOAL = 0.05  # [m]
-CENTRING = 0.35  # share of the distance to the line through cube and goal that the gripper corrects in a step
+# share of the distance to the line through cube and goal that the gripper corrects in a step
+CENTRING = 0.35
 DETOUR = 0.03  # extra length of the path around the cube from which the gripper goes over it [m]
 DOWN = 0.5  # share of a step after which a gripper that descends past the cube must be beside it
 LEG = 0.005  # cost of every leg of a path around the cube, added to its length [m]
@@ -105,14 +112,18 @@ def _touching(direction: F64) -> float:
 def _is_behind(env: FetchEnv) -> bool:
     direction, way = _direction(env), _to_cube(env)[:2]
     along, off = way @ direction, abs(way[0] * direction[1] - way[1] * direction[0])
-    return bool(0 < along < _touching(direction) + ALONG and off < ACROSS and -_to_cube(env)[2] < BELOW)
+    return bool(
+        0 < along < _touching(direction) + ALONG and off < ACROSS and -_to_cube(env)[2] < BELOW
+    )
 
 
 def _push(env: FetchEnv) -> tuple[F64, float]:
     """Move at full speed in the direction to push, and towards the line through cube and goal."""
     direction = _direction(env)
     across = np.array([-direction[1], direction[0]])
-    way = direction * (REACH / np.abs(direction).max()) + CENTRING * across * (_to_cube(env)[:2] @ across)
+    way = direction * (REACH / np.abs(direction).max()) + CENTRING * across * (
+        _to_cube(env)[:2] @ across
+    )
     return np.append(way, _to_cube(env)[2] + LOW), CLOSE
 
 
@@ -129,17 +140,24 @@ def _around(env: FetchEnv) -> tuple[F64, float]:
 
 
 def _is_better_over(env: FetchEnv) -> bool:
-    """Whether the cube is in the way, and the path around it is long or the gripper is high already."""
+    """Whether the cube is in the way, and the path around it is long or the gripper is high
+    already.
+    """
     start, end = _ends(env)
     height = -_to_cube(env)[2]
     if _is_free(start, end) or (_is_inside(start) and height < HIGH - 0.02):
         return False
-    around = sum(float(np.abs(two - one).max()) for one, two in itertools.pairwise([start, *_path(start, end)]))
+    around = sum(
+        float(np.abs(two - one).max())
+        for one, two in itertools.pairwise([start, *_path(start, end)])
+    )
     return height >= HIGH - 0.015 or around - np.abs(end - start).max() >= DETOUR
 
 
 def _over_cube(env: FetchEnv) -> tuple[F64, float]:
-    """Go straight over the cube to behind it: rise before crossing it, and descend as soon as it is past."""
+    """Go straight over the cube to behind it: rise before crossing it, and descend as soon as it
+    is past.
+    """
     start, end = _ends(env)
     way = _walk(start, [end])
     if not _is_inside(start) and REACH - _to_cube(env)[2] < HIGH:
@@ -159,7 +177,12 @@ def _path(start: F64, end: F64) -> list[F64]:
     if _is_free(start, end):
         return [end]
     ways = [[one, end] for one in CORNERS if _is_free(one, end)]
-    ways += [[one, two, end] for one in CORNERS for two in CORNERS if _is_free(one, two) and _is_free(two, end)]
+    ways += [
+        [one, two, end]
+        for one in CORNERS
+        for two in CORNERS
+        if _is_free(one, two) and _is_free(two, end)
+    ]
     seen = [way for way in ways if _is_free(start, way[0])]
     return min(seen or ways or [[end]], key=lambda way: _length([start, *way]))
 
@@ -193,7 +216,9 @@ def _is_free(start: F64, end: F64) -> bool:
 
 
 LADDERS: dict[str, tuple[PackagedRung, ...]] = {
-    "FetchReach-v4": (PackagedRung("approach", always, lambda env: (env.goal - env.gripper, CLOSE)),),
+    "FetchReach-v4": (
+        PackagedRung("approach", always, lambda env: (env.goal - env.gripper, CLOSE)),
+    ),
     "FetchPush-v4": (
         PackagedRung("hold", _rests_at_goal, lambda env: (np.zeros(3), CLOSE)),
         PackagedRung("push", _is_behind, _push),

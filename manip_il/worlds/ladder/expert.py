@@ -22,8 +22,9 @@ NEAR = 0.03  # distance of the hand from its target below which lack of progress
 class LadderExpert(Expert):
     """Labels any state of one scene.
 
-    The same state gives bit-equal labels in any order and process: inverse kinematics starts from the measured joints
-    with a fixed posture target, and the phase follows from the geometry, gripper opening and touch.
+    The same state gives bit-equal labels in any order and process: inverse kinematics starts from
+    the measured joints with a fixed posture target, and the phase follows from the geometry,
+    gripper opening and touch.
     """
 
     def __init__(self, scene: Scene):
@@ -36,10 +37,12 @@ class LadderExpert(Expert):
     def label(self, state: State, environment: Environment | ManipEnv | None = None) -> Label:
         """Return the expert's action in `state`: joint targets [rad] and gripper command [m], (n,).
 
-        environment: one of the same scene that is already in this state, with poses up to date; it is only read.
+        environment: one of the same scene that is already in this state, with poses up to date; it
+        is only read.
 
-        If there is no sound action (object out of reach, inverse kinematics without a solution), `valid` is false,
-        `reason` says why, and the action holds the arm still. Raises `MismatchError` for a state of another scene.
+        If there is no sound action (object out of reach, inverse kinematics without a solution),
+        `valid` is false, `reason` says why, and the action holds the arm still. Raises
+        `MismatchError` for a state of another scene.
         """
         if isinstance(environment, ManipEnv) and environment.scene is self._scene:
             world = environment.world
@@ -54,9 +57,14 @@ class LadderExpert(Expert):
                 target = rung.target(world)
                 if not isinstance(target, Target):
                     kind = type(target).__name__
-                    raise ManipError(f"{self._scene.name}: rung {rung.name!r} returned a {kind}; expected a Target")
+                    raise ManipError(
+                        f"{self._scene.name}: rung {rung.name!r} returned a {kind}; expected a"
+                        " Target"
+                    )
                 return self._towards(q, world.opening, target, phase)
-        raise ManipError(f"{self._scene.name}: no rung holds; expected the last rung to hold in every state")
+        raise ManipError(
+            f"{self._scene.name}: no rung holds; expected the last rung to hold in every state"
+        )
 
     def _unsound(self, world: World) -> str:
         hand = world.ee.position.tolist()
@@ -84,10 +92,13 @@ class LadderExpert(Expert):
         action = self._scene.actions.join(q + dq, target.opening)
         return Label(np.minimum(np.maximum(action, low), high), phase, True, residual)
 
-    def _step(self, q: F64, position: F64, rotation: F64, target: Target) -> tuple[F64, float] | None:
+    def _step(
+        self, q: F64, position: F64, rotation: F64, target: Target
+    ) -> tuple[F64, float] | None:
         """Return a joint step [rad] and the share of the error that it leaves.
 
-        If the target is `exact`, the step is solved again with the pose shifted by the error of the first solution.
+        If the target is `exact`, the step is solved again with the pose shifted by the error of the
+        first solution.
         """
         ik, most = self._ik, self._scene.robot.max_joint_step
         first = ik.step(position, rotation, most, target.lean)
@@ -101,7 +112,9 @@ class LadderExpert(Expert):
     def _hold(self, q: F64, opening: float, reason: str) -> Label:
         actions = self._scene.actions
         action = actions.join(q, opening)
-        return Label(np.minimum(np.maximum(action, actions.low), actions.high), 0, False, 1.0, reason)
+        return Label(
+            np.minimum(np.maximum(action, actions.low), actions.high), 0, False, 1.0, reason
+        )
 
 
 def _clip_norm(vector: F64, longest: float) -> F64:

@@ -39,7 +39,14 @@ from manip_il.sim.world import World
 from manip_il.tasks import ENV_IDS
 from manip_il.tasks.table import TASKS, get_task, is_task, source_hash
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.contract import OPENINGS, SERVOS, Environment, EnvironmentSpec, Outcome, WorldKind
+from manip_il.worlds.contract import (
+    OPENINGS,
+    SERVOS,
+    Environment,
+    EnvironmentSpec,
+    Outcome,
+    WorldKind,
+)
 from manip_il.worlds.fingerprint import environment_fingerprint
 from manip_il.worlds.ladder.expert import LadderExpert
 from manip_il.worlds.table import make_config
@@ -58,7 +65,9 @@ def config_scene(config: EnvConfig) -> Scene:
     return build_scene(*parts_of(config), config.physics_step)
 
 
-def env_of(config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> ManipEnv:
+def env_of(
+    config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
+) -> ManipEnv:
     """Return the environment that these settings describe."""
     return ManipEnv(*parts_of(config), config, cameras=cameras, conditions=conditions)
 
@@ -74,14 +83,23 @@ def make_env(
     conditions: Sequence[Condition] = (),
     **settings: Any,
 ) -> ManipEnv:
-    """Return the environment of a robot, by its name or its YAML's path, and a task, by its name or its file's path.
+    """Return the environment of a robot, by its name or its YAML's path, and a task, by its name or
+    its file's path.
 
-    cameras: names; image_size: height and width of their pictures [pixels]. settings: fields of `EnvConfig`; the rest
-    is as in `ManipEnv`. Raises what `make_config`, `CameraConfig` and `ManipEnv` raise.
+    cameras: names; image_size: height and width of their pictures [pixels]. settings: fields of
+    `EnvConfig`; the rest is as in `ManipEnv`. Raises what `make_config`, `CameraConfig` and
+    `ManipEnv` raise.
     """
     config = make_config(robot, task, **settings)
     seen = CameraConfig(tuple(cameras), *image_size, look or Look()) if cameras else None
-    return ManipEnv(*parts_of(config), config, cameras=seen, look=look, render_mode=render_mode, conditions=conditions)
+    return ManipEnv(
+        *parts_of(config),
+        config,
+        cameras=seen,
+        look=look,
+        render_mode=render_mode,
+        conditions=conditions,
+    )
 
 
 def parts_of(config: EnvConfig) -> tuple[Robot, Task]:
@@ -99,7 +117,9 @@ _DEEP = 1e-3  # largest overlap of a moved object with another [m]
 
 
 def redrawn(world: World, visited: State, rng: np.random.Generator) -> State | None:
-    """Return a scene with new goals and new places of untouched objects; None if the drawn places overlap.
+    """Return a scene with new goals and new places of untouched objects.
+
+    None if the drawn places overlap.
 
     world: restored and changed.
     """
@@ -126,7 +146,9 @@ def redrawn(world: World, visited: State, rng: np.random.Generator) -> State | N
 
 
 def _untouched(world: World) -> set[int]:
-    """Return bodies of objects and furniture that are at rest and touch only what is fixed to the world."""
+    """Return bodies of objects and furniture that are at rest and touch only what is fixed to
+    the world.
+    """
     model, (roots, _) = world.model, _contacts(world)
     touched = set(roots[(roots > 0).all(axis=1) & (roots[:, 0] != roots[:, 1])].ravel().tolist())
     ee = world.ee.position.tolist()
@@ -142,7 +164,9 @@ def _untouched(world: World) -> set[int]:
 def _markers(model: mujoco.MjModel) -> set[int]:
     """Return the bodies that mark goals: mocap bodies without collisions."""
     solid = set(model.body_rootid[model.geom_bodyid[model.geom_contype > 0]].tolist())
-    return {body for body in range(model.nbody) if model.body_mocapid[body] >= 0 and body not in solid}
+    return {
+        body for body in range(model.nbody) if model.body_mocapid[body] >= 0 and body not in solid
+    }
 
 
 def _near_hand(world: World, at: F64, rng: np.random.Generator) -> F64:
@@ -157,21 +181,27 @@ def _contacts(world: World) -> tuple[NDArray[np.int32], F64]:
     return model.body_rootid[model.geom_bodyid[contacts.geom]], -contacts.dist
 
 
-LIMITS_HZ = 20  # control rate for which tasks give their limits [Hz]; at other rates they last as many seconds
-_TURNED = ("carry", "insert", "insert_tight", "press")  # tasks whose furniture older versions rendered without its yaw
+# control rate for which tasks give their limits [Hz]; at other rates they last as many seconds
+LIMITS_HZ = 20
+# tasks whose furniture older versions rendered without its yaw
+_TURNED = ("carry", "insert", "insert_tight", "press")
 
 
 class LadderEnv(ManipEnv, Environment):
     """`ManipEnv` behind the contract, whose `step` it has in place of gymnasium's."""
 
-    def __init__(self, config: EnvConfig, cameras: CameraConfig | None, conditions: Sequence[Condition]):
+    def __init__(
+        self, config: EnvConfig, cameras: CameraConfig | None, conditions: Sequence[Condition]
+    ):
         super().__init__(*parts_of(config), config, cameras=cameras, conditions=conditions)
         self.actions = self.scene.actions
         self._object = stored(config.object)
 
     @property
     @override
-    def spec(self) -> EnvironmentSpec:  # pyright: ignore[reportIncompatibleVariableOverride]  # of gymnasium
+    def spec(
+        self,
+    ) -> EnvironmentSpec:  # pyright: ignore[reportIncompatibleVariableOverride]  # of gymnasium
         scene, task = self.scene, self._task
         servos = scene.robot.lerobot
         return EnvironmentSpec(
@@ -194,7 +224,9 @@ class LadderEnv(ManipEnv, Environment):
         )
 
     @override
-    def step(self, action: NDArray[Any]) -> Outcome:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def step(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, action: NDArray[Any]
+    ) -> Outcome:
         return Outcome(self.advance(action), self.reward, self.solved)
 
     @override
@@ -220,7 +252,10 @@ class LadderKind(WorldKind):
 
     @override
     def complete(self, config: EnvConfig) -> EnvConfig:
-        """Canonicalise the object (the default becomes "") and the task's argument; fill in rate and task."""
+        """Canonicalise the object (the default becomes "") and the task's argument.
+
+        Fill in rate and task.
+        """
         task, robot = get_task(config.task), get_robot(config.robot)
         for file in (config.task, config.robot, mesh_path(config.object)):
             if isinstance(file, Path):
@@ -231,7 +266,10 @@ class LadderKind(WorldKind):
             shape, other = ObjectShape.parse(config.object), get_task(config.task, config.object)
             is_own = shape == task.shape
             named = config.object if isinstance(config.object, Path) else str(shape)
-            task, config = task if is_own else other, replace(config, object="" if is_own else named)
+            task, config = (
+                task if is_own else other,
+                replace(config, object="" if is_own else named),
+            )
         control_hz = config.control_hz or robot.fps
         rate = control_hz / LIMITS_HZ
         return replace(
@@ -256,13 +294,20 @@ class LadderKind(WorldKind):
     def fingerprint(self, config: EnvConfig) -> dict[str, str]:
         robot, task = parts_of(config)
         name, _, argument = task.name.partition(":")
-        settings = asdict(config) | {"robot": robot.name, "task": name, "object": stored(config.object)}
-        settings |= {"reward": argument} if argument else {}  # as in older fingerprints, where only carry has it
+        settings = asdict(config) | {
+            "robot": robot.name,
+            "task": name,
+            "object": stored(config.object),
+        }
+        # as in older fingerprints, where only carry has it
+        settings |= {"reward": argument} if argument else {}
         if not config.object:  # as in fingerprints of versions that had no `object`
             del settings["object"]
         own = {} if name in TASKS else {"task_sha256": source_hash(task)}
         if robot.name not in ROBOTS:  # a user's own robot: hash its values, not its files' paths
-            said = replace(robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None))
+            said = replace(
+                robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None)
+            )
             own["robot_sha256"] = hashlib.sha256(repr(said).encode()).hexdigest()
         if config.object and (mesh := ObjectShape.parse(config.object).mesh):
             own["object_sha256"] = mesh.sha256
@@ -282,7 +327,11 @@ class LadderKind(WorldKind):
     def lerobot_words(self, robot: str, task: str) -> list[str]:
         name, colon, argument = task.partition(":")
         named = next((env_id for env_id, names in ENV_IDS.items() if names == (robot, name)), None)
-        return ["--env.type=manip_il", f"--env.task={named.partition('/')[2]}{colon}{argument}"] if named else []
+        return (
+            ["--env.type=manip_il", f"--env.task={named.partition('/')[2]}{colon}{argument}"]
+            if named
+            else []
+        )
 
     @override
     def success(self, tolerance: float, steps: int) -> str:

@@ -1,4 +1,6 @@
-"""The grid of `carry`: costs are those of paths, paths keep off obstacles, their features are line integrals."""
+"""The grid of `carry`: costs are those of paths, paths keep off obstacles, their features are
+line integrals.
+"""
 
 import math
 from functools import cache
@@ -70,12 +72,16 @@ def test_an_edges_features_are_the_line_integrals_of_any_path():
         assert features[0] == pytest.approx(along[0], rel=1e-12)
 
 
-@pytest.mark.parametrize("name", ["above_laptop", "near_vase", "near_candle", "near_edge", "height"])
+@pytest.mark.parametrize(
+    "name", ["above_laptop", "near_vase", "near_candle", "near_edge", "height"]
+)
 def test_a_heavier_weight_keeps_planned_paths_no_nearer(name: str):
     at, found = FEATURES.index(name), []
     for weight in (0.0, 0.5, 2.0, 8.0, 30.0):
         planned = plan(grid().problem, weights_with(**{name: weight}))
-        found.append([cheapest_path(grid().problem, planned, node_near(start))[1][at] for start in STARTS])
+        found.append(
+            [cheapest_path(grid().problem, planned, node_near(start))[1][at] for start in STARTS]
+        )
     assert (np.diff(found, axis=0) <= 1e-9).all()
     assert (np.array(found[-1]) < found[0]).any()
 
@@ -112,7 +118,9 @@ def test_the_descent_leads_on_from_beside_any_node(seed: int):
 @every_robot
 def test_the_grid_takes_the_map_of_where_the_hand_gets_to(robot: str):
     arm, reach = get_robot(robot), reach_of(get_robot(robot))
-    points = np.array([*arm.workspace.centre, 0.1]) + np.random.default_rng(0).uniform(-0.4, 0.4, (500, 3)) * [
+    points = np.array([*arm.workspace.centre, 0.1]) + np.random.default_rng(0).uniform(
+        -0.4, 0.4, (500, 3)
+    ) * [
         1,
         1,
         0.5,

@@ -1,4 +1,6 @@
-"""Rewards of `carry`: read from a name, a file or a text, refused in one line, and kept as numbers."""
+"""Rewards of `carry`: read from a name, a file or a text, refused in one line, and kept as
+numbers.
+"""
 
 import json
 from pathlib import Path
@@ -32,7 +34,9 @@ def test_an_environment_keeps_what_is_in_a_file_and_not_where_it_is(tmp_path: Pa
     assert make_config(task="carry:careful") == make_config(task="carry")
 
 
-@pytest.mark.parametrize(("task", "sha256"), [("carry", "d165c820ba2f39ca"), ("carry:low", "9f48c3c88734fc0d")])
+@pytest.mark.parametrize(
+    ("task", "sha256"), [("carry", "d165c820ba2f39ca"), ("carry:low", "9f48c3c88734fc0d")]
+)
 def test_a_reward_in_the_name_has_the_fingerprint_that_it_had_as_a_setting(task: str, sha256: str):
     assert env_fingerprint(make_config(task=task))["config_sha256"].startswith(sha256)
 

@@ -1,4 +1,6 @@
-"""Carry: nothing is touched, the way is a reward's, and the reward is part of the state but is not observed."""
+"""Carry: nothing is touched, the way is a reward's, and the reward is part of the state but is
+not observed.
+"""
 
 import numpy as np
 import pytest
@@ -8,7 +10,14 @@ from manip_il.sim.env import ManipEnv, environment_state, environment_state_name
 from manip_il.sim.task import phases
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.carry.layout import OBSTACLES, TASTES
-from manip_il.tasks.carry.obstacles import EDGE, TASTE_BODIES, is_there, layout_of, observed_layout, reward_in
+from manip_il.tasks.carry.obstacles import (
+    EDGE,
+    TASTE_BODIES,
+    is_there,
+    layout_of,
+    observed_layout,
+    reward_in,
+)
 from manip_il.tasks.carry.task import OBJECT, descent_of
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
@@ -105,7 +114,9 @@ def test_one_to_four_obstacles_stand_where_they_leave_room(robot: str):
         ends = np.array([env.world.pose(OBJECT).position, env.world.goal])
         assert layout.room(ends).min() >= 0
         if layout.edge is not None:
-            assert ((np.array(layout.edge.at) - ends[:, :2]) @ np.array(layout.edge.outwards) > 0).all()
+            assert (
+                (np.array(layout.edge.at) - ends[:, :2]) @ np.array(layout.edge.outwards) > 0
+            ).all()
     assert set(counts) == {1, 2, 3, 4} if robot != "so101" else set(counts) >= {1, 2, 3}
 
 
@@ -116,9 +127,9 @@ def test_what_is_observed_is_the_layout():
         seen = dict(zip(names, environment_state(world).tolist(), strict=True))
         layout, observed = layout_of(world, OBJECT), observed_layout(world.scene, OBJECT, seen)
         assert [name for name, _ in observed.places] == [name for name, _ in layout.places]
-        points = np.array([*world.scene.robot.workspace.centre, 0.1]) + np.random.default_rng(0).uniform(
-            -0.1, 0.1, (50, 3)
-        )
+        points = np.array([*world.scene.robot.workspace.centre, 0.1]) + np.random.default_rng(
+            0
+        ).uniform(-0.1, 0.1, (50, 3))
         np.testing.assert_allclose(observed.densities(points), layout.densities(points), atol=1e-4)
         np.testing.assert_allclose(observed.room(points), layout.room(points), atol=1e-6)
         assert not {name for name in seen if name.startswith("taste")}
