@@ -45,6 +45,7 @@ _STEPS = (  # registry names of LeRobot's default steps, and ours: they load not
     *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER, JOINTS_ALONE),
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+MOST_VALUES = 10_000  # in one numeric input of a network, or in its action
 # prefix of dummy cameras that LeRobot's language policies fill in themselves
 _PLACEHOLDER = "empty_camera_"
 _MLP_SHAPE = (  # options that define an mlp's architecture
@@ -193,7 +194,7 @@ class Checkpoint:
                 path,
                 config,
                 numbers={
-                    key: math.prod(shape)
+                    key: _size(key, shape)
                     for key, (kind, shape) in inputs.items()
                     # not the environment state of `JointsAloneStep`
                     if kind in ("STATE", "ENV") and all(shape)
@@ -203,7 +204,7 @@ class Checkpoint:
                     for name, (height, width) in sizes.items()
                     if not name.startswith(_PLACEHOLDER)
                 },
-                action=math.prod(outputs[ACTION][1]),
+                action=_size(ACTION, outputs[ACTION][1]),
                 space=space,
                 robot=robot,
                 grippers=grippers,
@@ -289,6 +290,10 @@ class Checkpoint:
         """
         steps = [step for steps in self.processors.values() for step in steps]
         require_trust(self.config, str(self.path), trust, steps)
+
+
+def _size(key: str, shape: Sequence[int]) -> int:
+    return checks.whole(f"the number of values of {key}", math.prod(shape), 0, MOST_VALUES)
 
 
 def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:

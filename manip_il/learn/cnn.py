@@ -19,13 +19,15 @@ from torch.nn.functional import interpolate
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, check_same_spec
 from manip_il.errors import UsageError, shorten
+from manip_il.learn.checkpoint import MOST_VALUES
 from manip_il.learn.mlp import MLPConfig, MLPPolicy, labelled
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork, NetworkConfig, fit_statistics, perceptron
 from manip_il.learn.samples import Table
-from manip_il.option import option
+from manip_il.option import bounded, option
 
+_MOST_LAYERS = 16
 __all__ = ["CNNConfig", "CNNPolicy", "make_cnn_pre_post_processors"]
 __path__: list[str] = []
 
@@ -74,13 +76,13 @@ class CNNConfig(MLPConfig):
     """
 
     channels: tuple[int, ...] = (16, 32, 32, 32)
-    keypoints: int = option(32, "keypoints per camera", at_least=1)
+    keypoints: int = option(32, "keypoints per camera", at_least=1, at_most=1024)
     aux_weight: float = option(0.5, "weight of the loss of the predicted state", at_least=0)
     states: str = option(
         "", "dataset of states; the policy then acts on joints and predicted state alone"
     )
-    privileged_size: int = 0
-    named_points: int = 0
+    privileged_size: int = bounded(0, 0, MOST_VALUES)
+    named_points: int = bounded(0, 0, 1024)
     heatmap_weight: float = 0.0
 
     depth: int = 2
@@ -90,9 +92,11 @@ class CNNConfig(MLPConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.channels) < 2 or min(self.channels) < 1:
+        sizes = self.channels
+        if not 2 <= len(sizes) <= _MOST_LAYERS or not 1 <= min(sizes) <= max(sizes) <= 1024:
             raise UsageError(
-                f"policy.channels is {shorten(list(self.channels))}; expected at least 2 numbers"
+                f"policy.channels is {shorten(list(sizes))}; expected 2 to {_MOST_LAYERS} layers,"
+                " of 1 to 1024 channels"
             )
         self.keypoints += self.named_points
         self.named_points = 0

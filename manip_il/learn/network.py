@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from manip_il.checks import native_path
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.action_spaces import LAST
-from manip_il.learn.checkpoint import WEIGHTS, in_one_line
+from manip_il.learn.checkpoint import MOST_VALUES, WEIGHTS, in_one_line
 from manip_il.learn.losses import LOSSES, make_head
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
 from manip_il.mdp import F32, F64
@@ -63,12 +63,12 @@ class NetworkConfig:
         UsageError: A size is out of range.
     """
 
-    width: int = option(256, "units per layer", at_least=1)
-    depth: int = option(3, "hidden layers", at_least=1)
+    width: int = option(256, "units per layer", at_least=1, at_most=4096)
+    depth: int = option(3, "hidden layers", at_least=1, at_most=32)
     activation: str = "silu"
     loss: str = "l1"
-    components: int = option(5, "Gaussians in a mixture", at_least=1)
-    bins: int = option(21, "bins per dimension", at_least=2)
+    components: int = option(5, "Gaussians in a mixture", at_least=1, at_most=1000)
+    bins: int = option(21, "bins per dimension", at_least=2, at_most=1000)
     sigma: float = option(3.0, "smearing of categorical targets [bins]", at_least=0)
     clamp: float = option(10.0, "bound on the inputs [standard deviations]", at_least=1e-9)
     action_space: str = JOINT_DELTA
@@ -85,6 +85,10 @@ class NetworkConfig:
         if not all(scale > 0 for scale in self.scales):
             raise UsageError(
                 f"policy.scales is {list(self.scales)}; expected lengths of more than 0"
+            )
+        if (added := len(self.scales) * len(self.scaled)) > MOST_VALUES:
+            raise UsageError(
+                f"policy.scales adds {added:,} inputs; expected at most {MOST_VALUES:,}"
             )
 
     @classmethod

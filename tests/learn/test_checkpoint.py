@@ -246,3 +246,26 @@ def test_an_encoder_that_a_checkpoint_names_is_made_only_where_it_is_trusted(act
         {"type": "gaussian_actor", "vision_encoder_name": "evil/encoder"}, trust=True
     )
     assert policy_config(allowed).type == "gaussian_actor"
+
+
+HUGE = [
+    *({"width": 60_000}, {"depth": 10**6}, {"bins": 10**6}, {"components": 10**6}),
+    {"scales": [1.0] * 1000, "scaled": [0] * 1000},
+    {"input_features": {"observation.state": {"type": "STATE", "shape": [10**9]}}},
+]
+HUGE_CNN = [
+    *({"keypoints": 10**6}, {"channels": [8, 10**6]}, {"channels": [8] * 10**4}),
+    *({"privileged_size": 10**9}, {"named_points": 10**9}),
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [*(("mlp", one) for one in HUGE), *(("cnn", one) for one in HUGE + HUGE_CNN)],
+    ids=str,
+)
+def test_a_networks_numbers_have_the_bounds_of_its_options(kind, change, pictured, tmp_path):
+    options, seen = (CNN, "images") if kind == "cnn" else ({}, "state")
+    folder = write_checkpoint(tmp_path / "policy", kind, pictured, seen, **options)
+    edit_config(folder, **change)
+    refused(folder, "; expected", longest=700)
