@@ -4,6 +4,7 @@ policies fit it.
 
 import logging
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from manip_il import checks
@@ -41,15 +42,24 @@ def env_config(given: Mapping[str, Any], origin: Origin | None = None) -> EnvCon
     return complete(EnvConfig(**values))
 
 
-def own_files(spec: Any) -> list[str]:
-    """Return the options, with FILE for a path, that commands need for a robot and a task of the
-    user's own.
+def own_files(spec: Any, shape: str = "") -> list[str]:
+    """Return the options, with FILE for a path, that commands need for what is the user's own.
 
-    spec: the `EnvironmentSpec` of a dataset or the `Origin` of a policy, which only name them.
+    Args:
+        spec: The `EnvironmentSpec` of a dataset or the `Origin` of a policy, which only name it.
+        shape: The object, if an option for a mesh is wanted, too.
     """
     if spec.task == UNKNOWN_TASK:
         return []
-    return world_of(spec.robot).own_files(spec.robot, spec.task, "")
+    return world_of(spec.robot).own_files(spec.robot, spec.task, shape)
+
+
+def path_options(env: Mapping[str, Any]) -> list[str]:
+    """Return the options of an environment that name files of the user's own, which nothing that
+    is written stores.
+    """
+    flags = {"robot": "--robot.type", "task": "--task.type", "object": "--task.object"}
+    return [f"{flags[key]}={env[key]}" for key in flags if isinstance(env.get(key), Path)]
 
 
 def open_dataset(root: Any) -> Dataset:

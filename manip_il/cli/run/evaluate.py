@@ -7,6 +7,7 @@ from pathlib import Path
 from manip_il.cli.evaluate import EvalOptions
 from manip_il.cli.outputs import REPORT_FILE, OutputFile, about, publish
 from manip_il.cli.progress import Stages, say, say_next, warn
+from manip_il.collect.inputs import path_options
 from manip_il.collect.workers import default_workers
 from manip_il.data.atomic import write_file
 from manip_il.data.fingerprint import compare_fingerprints
@@ -69,6 +70,7 @@ def _evaluate(options: EvalOptions) -> None:
     say(f"result: {folder / FILE_NAME}", f"report: {folder / REPORT_FILE}")
     seed = next((one.seed for one in result.episodes if not one.success), result.episodes[0].seed)
     words = [] if policy.path is None else [f"--policy.path={policy.path}"]
+    words += path_options(options.env)
     say_next("eval", folder, *words, f"--replay={seed}", "--video=replay.mp4")
 
 

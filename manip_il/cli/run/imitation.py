@@ -22,7 +22,7 @@ from manip_il.cli.imitation import DaggerOptions, DemoOptions
 from manip_il.cli.outputs import REPORT_FILE, about, publish
 from manip_il.cli.parsing import Open, from_layers, from_yaml
 from manip_il.cli.progress import Stages, say, say_next, warn
-from manip_il.collect.inputs import env_config
+from manip_il.collect.inputs import env_config, path_options
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import parse_query
 from manip_il.collect.workers import Engine
@@ -72,14 +72,17 @@ def run_dagger(options: DaggerOptions) -> None:
         replace(page, **about(options)).write(folder / REPORT_FILE)
     if (folder / "dataset").is_dir():
         say(f"labels of all rounds as one dataset: {folder / 'dataset'}")
-    say_best(folder)
+    say_best(folder, path_options(vars(config.env)))
 
 
-def say_best(folder: Path) -> None:
-    """Print where a run's report and best policy are, and how to evaluate that."""
+def say_best(folder: Path, words: Sequence[str] = ()) -> None:
+    """Print where a run's report and best policy are, and how to evaluate that.
+
+    words: options that the policy does not store.
+    """
     best = folder / "best" / "pretrained_model"
     say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
-    say_next("eval", f"--policy.path={best}", f"--output_dir={folder}/test")
+    say_next("eval", f"--policy.path={best}", *words, f"--output_dir={folder}/test")
 
 
 def dagger_config(options: DaggerOptions) -> RunConfig:

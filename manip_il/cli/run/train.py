@@ -5,7 +5,7 @@ import os
 
 from manip_il.cli.imitation import RANK, TrainOptions
 from manip_il.cli.progress import Stages, say, say_next, set_quiet
-from manip_il.collect.inputs import open_dataset, why_not_simulated
+from manip_il.collect.inputs import open_dataset, own_files, why_not_simulated
 from manip_il.learn.train import train
 
 
@@ -46,4 +46,5 @@ def run_train(options: TrainOptions) -> None:
             program="lerobot-rollout",
         )
     else:
-        say_next("eval", path, f"--output_dir={folder}/eval")
+        words = own_files(first.spec, first.spec.object)
+        say_next("eval", path, *words, f"--output_dir={folder}/eval")
