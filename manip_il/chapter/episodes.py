@@ -235,7 +235,9 @@ class Lockstep:
             conversion: Turns the policy's raw targets into actions, given the measured joints (the
                 first inputs).
         """
-        self.episodes, self.range, self.horizon = episodes, actions, horizon
+        self.episodes = episodes
+        self.range = actions
+        self.horizon = horizon
         self._conversion = conversion or Conversion()
         self.simulated = 0
         self.executed: list[F64] = []

@@ -155,7 +155,8 @@ def _check_objects(scene: Scene) -> None:
     """Raise `UsageError` for an object that the scene does not have, or that is too wide or too
     low to grip.
     """
-    task, model, most = scene.task, scene.model, scene.gripper.most
+    task, model = scene.task, scene.model
+    most = scene.gripper.most
     for name in (*task.objects, *task.grasped):
         if name not in scene.objects:
             raise UnknownName(f"object of task {task.name}", name, scene.objects)

@@ -144,7 +144,9 @@ def apply(
 
 def _apply_object(changed: Any, plain: Any, one: Object, row: F64, shape: int | None) -> None:
     geom, body = one.geom, one.body
-    size, mass, friction = row[_SIZE], row[_MASS], row[_FRICTION]
+    size = row[_SIZE]
+    mass = row[_MASS]
+    friction = row[_FRICTION]
     kind = own = int(plain.geom_type[geom])
     changed.geom_condim[geom], changed.geom_friction[geom] = (
         plain.geom_condim[geom],
