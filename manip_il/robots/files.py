@@ -2,6 +2,7 @@
 
 import importlib.util
 import multiprocessing
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -14,6 +15,7 @@ import mujoco
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 
+_INCLUDE = re.compile(rb"<(?:include|model)\s[^>]*?\bfile\s*=\s*[\"']([^\"']+)")
 FRAGMENT = ": it is a fragment; expected the model that includes it"
 KEYS = ("model", "includes", "meshes", "mend")  # keys of `ModelFiles` in a YAML
 
@@ -57,6 +59,7 @@ class ModelFiles:
             model = self._mended(checks.read_bytes(self.model, "an MJCF"))
             home = self.includes or self.model.parent
             name = str(home / f"mended {self.model.name}")
+            _read_included(model, home)  # here first, because MuJoCo would wait for a pipe
             spec = mujoco.MjSpec.from_file(name, include={name: model})
             if self.meshes is not None:
                 # MuJoCo prefixes names in an included file with its folder
@@ -87,6 +90,21 @@ class ModelFiles:
                 )
             text = text.replace(old, new)
         return text.encode()
+
+
+def _read_included(model: bytes, home: Path) -> None:
+    """Read the files that a model includes or attaches, directly or not.
+
+    Raises `ManipError` for one that is not a regular file.
+    """
+    read = set[Path]()
+    waiting = [model]
+    while waiting:
+        for name in map(bytes.decode, _INCLUDE.findall(waiting.pop())):
+            path = home / name
+            if path not in read and path.exists():  # MuJoCo names a missing one
+                read.add(path)
+                waiting.append(checks.read_bytes(path, "an MJCF"))
 
 
 @cache
