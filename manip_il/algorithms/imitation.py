@@ -15,7 +15,7 @@ from manip_il.collect.query import parse_query
 from manip_il.collect.workers import Engine, engine_of
 from manip_il.data.atomic import CONFIG_FILE, output_of, require_ours, write_json
 from manip_il.data.schema import SIM_STATE, check_same_spec, features
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.sources import check_same_sources
@@ -57,6 +57,8 @@ def dagger(
     """
     folder = Path(output_dir).expanduser()
     progress = progress or Progress()
+    if isinstance(config, RunConfig) and options:
+        raise UsageError(f"{', '.join(options)}: expected in the RunConfig that was given")
     if not isinstance(config, RunConfig):
         config = run_config(config, **options)
     check_labels(config)

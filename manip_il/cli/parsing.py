@@ -368,7 +368,8 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _
             raw[places[-1].name] = _Value(places[-1], list(words[number + 1 :]), places[-1].label)
             break
         if word.startswith("--"):
-            name = name.replace("-", "_")  # accept --output-dir
+            if _find(ours := name.replace("-", "_"), known):  # accept --output-dir
+                name = ours
             option = _find(name, known)
             if option is None or option.positional:
                 raise _unknown_option("option", name, known, "--", command)

@@ -27,10 +27,7 @@ def dataset(tmp_path_factory) -> Path:
 def test_what_is_exported_is_imported_as_far_as_the_mapping_names_it(dataset, tmp_path, capsys):
     out, mapping = tmp_path / "out", tmp_path / "m.yaml"
     assert main(["data", "to-mcap", str(dataset), str(out)]) == 0
-    assert (
-        f"manip-il data from-mcap {out} DATASET --mapping={out / 'mapping.yaml'}"
-        in capsys.readouterr().out
-    )
+    assert (out / "mapping.yaml").is_file()
     assert (
         main(
             [
