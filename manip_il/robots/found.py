@@ -45,9 +45,13 @@ _DIGITS = 4  # decimals of a posture [rad]
 
 
 def complete(said: dict[str, Any]) -> Robot:
-    """Complete a YAML's fields from the robot's model; return the robot.
+    """Complete a YAML's fields from the robot's model, and return the robot.
 
-    Raises `UsageError` for a field not found.
+    Args:
+        said: The fields of `Robot` that the YAML gives.
+
+    Raises:
+        UsageError: If a field cannot be found in the model.
     """
     name, names = said["name"], said["joints"]
     spec = bare_spec(name, said["files"], said["hand"], said["gripper"])

@@ -34,14 +34,18 @@ _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Measured relation between command and opening.
+    """Measured relation between command and opening, at c commands.
 
-    shares: how far the driven joints are, or are commanded to be, from closed (0) to open (1);
-    rising, (c,). openings: gaps between the pads at these [m], rising, (c,). middles: offsets along
-    the hand's y of the midpoint between the pads [m], (c,); all 0 if both sides move alike. pads:
-    for each finger, the indices of its pads among its geoms, nearest to the other finger first.
-    holding: for each finger, the indices of the geoms that may hold an object. linked: positions of
-    a linkage's undriven joints, by name, (c,).
+    Attributes:
+        shares: How far the driven joints are, or are commanded to be, from closed (0) to open (1);
+            rising, (c,).
+        openings: Gaps between the pads at these [m], rising, (c,).
+        middles: Offsets along the hand's y of the midpoint between the pads [m], (c,); all 0 if
+            both sides move alike.
+        pads: For each finger, the indices of its pads among its geoms, nearest to the other finger
+            first.
+        holding: For each finger, the indices of the geoms that may hold an object.
+        linked: Positions of a linkage's undriven joints, by name, (c,).
     """
 
     shares: F64
@@ -53,11 +57,29 @@ class Sweep:
 
 
 class Gripper:
-    """A robot's gripper within a compiled model. prefix: prefix of the robot's names in the
-    model.
+    """A robot's gripper within a compiled model.
+
+    Attributes:
+        q: Indices of the g driven joints into `qpos`, (g,).
+        ctrl: Indices of their actuators into `ctrl`, (g,).
+        geoms: Ids of all geoms of the fingers that have contacts.
+        pads: For each finger, the ids of its pads, nearest to the other finger first.
+        lopsided: Whether one jaw is fixed, so that the midpoint between the pads moves.
+        least: Opening of the closed gripper [m].
+        most: Opening of the open gripper [m].
     """
 
     def __init__(self, robot: Robot, model: mujoco.MjModel, prefix: str = ""):
+        """Find the gripper's joints, actuators and geoms in the model.
+
+        Args:
+            robot: The robot.
+            model: A compiled model that contains the robot.
+            prefix: Prefix of the robot's names in the model.
+
+        Raises:
+            UsageError: If the fingers do not come apart, or one has no geom with contacts.
+        """
         config, self._sweep = robot.gripper, sweep(robot)
         self.q = np.array(
             [model.joint(prefix + name).qposadr[0] for name in config.joints], dtype=np.int64
@@ -142,7 +164,10 @@ class Gripper:
     def touches(self, model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> bool:
         """Return whether every finger touches a geom.
 
-        Needs kinematics to be up to date in `data`.
+        Args:
+            model: The compiled model.
+            data: Its data, with up-to-date kinematics.
+            geom: Id of the geom.
         """
         # For two separate boxes `mj_geomDistance` sometimes returns 0, but only if they are nearer
         # than `TOUCH`.
@@ -269,11 +294,20 @@ def _near(gaps: F64, geoms: Sequence[int], least: float) -> list[int]:
 def finger_geoms(
     model: mujoco.MjModel, fingers: Sequence[str], prefix: str = ""
 ) -> list[tuple[int, ...]]:
-    """Return for each finger the ids of the geoms with contacts on its body and that body's
-    descendants.
+    """Find the geoms with contacts on each finger's body and on that body's descendants.
 
-    A descendant that is another finger is left out. prefix: prefix of the bodies' names. Raises
-    `UsageError` for a finger without such a geom.
+    A descendant that is another finger is left out.
+
+    Args:
+        model: A compiled model.
+        fingers: Names of the fingers' bodies, without the prefix.
+        prefix: Prefix of the bodies' names in the model.
+
+    Returns:
+        For each finger, the ids of its geoms, rising.
+
+    Raises:
+        UsageError: If a finger has no such geom.
     """
     owners = {model.body(prefix + name).id: place for place, name in enumerate(fingers)}
     for body in range(1, model.nbody):

@@ -150,8 +150,19 @@ class ArmIK:
     def displacement(
         self, position: F64, rotation: F64, largest: float, weight: float | None = None
     ) -> F64 | None:
-        """Return only the displacement of `step`, (arm,) [rad]. weight: rotation cost, else
-        `Costs.orientation`.
+        """Return the joint displacement of one `step` alone, without the error that remains.
+
+        It starts from the posture of the last `ee_pose` call.
+
+        Args:
+            position: Target of `ee` in the world, (3,) [m].
+            rotation: Its target rotation, (3, 3).
+            largest: Longest step of a joint [rad].
+            weight: Cost per radian of rotation error; by default `Costs.orientation`.
+
+        Returns:
+            The displacement, (arm,) [rad], scaled down as a whole if one joint exceeds `largest`;
+            None if the program has no solution.
         """
         self._program.frame.cost[3:] = self._costs.orientation if weight is None else weight
         x = self._program.solve(position, rotation)

@@ -57,8 +57,11 @@ _BLOCKED = 0.1  # error added for a posture in which the robot collides with its
 class Reach:
     """A grid of points and an error for each: how far from the point the downward hand ends up.
 
-    Eight neighbouring points are the corners of a cell. origin: the grid's first point, (3,) [m].
-    errors: [m], an array with the axes x, y and z.
+    Eight neighbouring points are the corners of a cell.
+
+    Attributes:
+        origin: The grid's first point, (3,) [m].
+        errors: Error at each point, an array with the axes x, y and z [m].
     """
 
     origin: F64
