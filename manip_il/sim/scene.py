@@ -43,8 +43,14 @@ _PEDESTAL = 0.13  # half the pedestal's width [m]
 def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
     """Return the scene of a robot and a task, compiled once and cached.
 
-    step: physics time step [s]. Raises `UsageError` if the scene does not compile, lacks an object
-    of the task, or has one to grasp that is too wide for the gripper.
+    Args:
+        robot: The robot.
+        task: The task, whose fixed parts are scaled to the robot.
+        step: Physics time step [s].
+
+    Raises:
+        UsageError: If the scene does not compile, lacks an object of the task, or has one to grasp
+            that does not fit the gripper.
     """
     task = task.fitted(robot)
     try:

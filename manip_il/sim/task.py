@@ -60,9 +60,11 @@ class Rung:
 
 @dataclass(frozen=True)
 class Start:
-    """Drawn start of an episode. poses: body name -> (position (3,) [m], quaternion wxyz (4,)).
+    """Drawn start of an episode.
 
-    The bodies are objects and mocap bodies; those without a pose start where `build` put them.
+    Attributes:
+        poses: Name of a body -> its position, (3,) [m], and its quaternion wxyz, (4,). The bodies
+            are objects and mocap bodies; those without a pose start where `build` put them.
     """
 
     poses: Mapping[str, tuple[F64, F64]]

@@ -42,7 +42,12 @@ _NOT_PHYSICS = WORLD_SIZE - RANGES["posture"].places[0]
 class Object:
     """A free body of a compiled model, and its first geom, which gives its shape.
 
-    q, v: where its free joint starts in qpos and qvel.
+    Attributes:
+        name: Name of the body.
+        body: Id of the body.
+        geom: Id of the geom.
+        q: Where its free joint starts in `qpos`.
+        v: Where its free joint starts in `qvel`.
     """
 
     name: str
@@ -125,10 +130,16 @@ def apply(
     motors: I64,
     variation: F64,
 ) -> None:
-    """Apply `variation` (v,) to the objects and the arm of a model that is not shared.
+    """Apply a variation to the objects and the arm of a model that is not shared.
 
-    plain: the model as compiled. motors: actuators of the arm's joints, (arm,). Call `mj_setConst`
-    afterwards: it updates what depends on masses.
+    Call `mj_setConst` afterwards: it updates what depends on masses.
+
+    Args:
+        model: The model, changed in place.
+        plain: The model as compiled.
+        objects: The model's objects, by name, in the order of the variation.
+        motors: Ids of the actuators of the arm's joints, (arm,).
+        variation: The variation, (v,).
     """
     # kv changes by the square root of kp's factor, which keeps the damping ratio.
     damping, gain = part(variation, "joint_damping"), part(variation, "actuator_gain")
