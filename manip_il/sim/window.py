@@ -107,7 +107,7 @@ class Window:
         return self._handle.is_running()
 
     def show(self, data: mujoco.MjData, variation: F64, text: str = "") -> None:
-        """Show the physics, then wait for real time. A closed window shows nothing.
+        """Show the physics, then wait for real time; do nothing if the window is closed.
 
         Args:
             data: The scene's data.

@@ -279,8 +279,8 @@ class World:
             position: Position of the hand, (3,) [m].
 
         Returns:
-            The yaws [rad] in the arm's range that are equivalent to `yaw`; if there are none, the
-            one nearest to `ahead`.
+            The yaws [rad] in the arm's range that are equivalent to `yaw`; if there are none, or if
+            the hand turns without limits, only the one nearest to `ahead`.
         """
         low, high = self.scene.yaws
         off = math.remainder(yaw - self.ahead(position), alike)
