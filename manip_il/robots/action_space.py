@@ -25,14 +25,26 @@ class ServoUnits:
     percents: F64
 
     def of(self, arm: F64, opening: float) -> tuple[F64, float]:
-        """Return degrees (n - 1,) and gripper position, 0 to 100, for joints (n - 1,) [rad] and
-        an opening [m].
+        """Convert joints and a gripper opening to servo units.
+
+        Args:
+            arm: Joints, (n - 1,) [rad].
+            opening: Opening of the gripper [m].
+
+        Returns:
+            The joints, (n - 1,) [deg], and the gripper's position, 0 to 100.
         """
         return np.degrees(arm), float(np.interp(opening, self.openings, self.percents))
 
     def back(self, arm: F64, percent: float) -> tuple[F64, float]:
-        """Return joints (n - 1,) [rad] and opening [m] for degrees (n - 1,) and gripper
-        position, 0 to 100.
+        """Convert servo units to joints and a gripper opening.
+
+        Args:
+            arm: Joints, (n - 1,) [deg].
+            percent: Position of the gripper, 0 to 100.
+
+        Returns:
+            The joints, (n - 1,) [rad], and the opening of the gripper [m].
         """
         order = np.argsort(self.percents)  # rising, as `interp` needs them
         return np.radians(arm), float(
@@ -70,8 +82,11 @@ class ActionSpace:
         return len(self.names)
 
     def join(self, arm: F64, opening: float) -> F64:
-        """Return the action, or measured state, (n,) for joint values (n - 1,) [rad] and an
-        opening [m].
+        """Return the action, or measured state, of joints and an opening, (n,).
+
+        Args:
+            arm: Joints, (n - 1,) [rad].
+            opening: Opening of the gripper [m].
         """
         if self.units is not None:
             arm, opening = self.units.of(arm, opening)

@@ -141,8 +141,14 @@ def read(what: str, kind: Any, value: Any) -> Any:
 
 
 def require_lengths(one: Any, **counts: int) -> None:
-    """Raise `ManipError` if a field of `one` does not have the number of values that `counts`
-    gives for it.
+    """Check how many values the fields of an object have.
+
+    Args:
+        one: The object.
+        counts: Number of values that each field must have, by the field's name.
+
+    Raises:
+        ManipError: If a field has another number of values.
     """
     for name, count in counts.items():
         if len(getattr(one, name)) != count:

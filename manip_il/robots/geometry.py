@@ -112,9 +112,7 @@ def nearest(
 
 
 class Body:
-    """A robot with its gripper open, to detect self-collisions other than those in its home
-    posture.
-    """
+    """A robot with its gripper open, to detect self-collisions that do not occur at home."""
 
     def __init__(self, robot: Robot):
         self._model = arm_spec(robot).compile()
@@ -141,8 +139,9 @@ class Body:
 
 
 def rotation_vector(rotation: F64) -> F64:
-    """Return the rotation vector (3,), axis times angle [rad], at most pi long, of a rotation
-    matrix (3, 3).
+    """Return the rotation vector of a rotation matrix (3, 3): axis times angle, (3,) [rad].
+
+    It is at most pi long.
     """
     quaternion, vector = np.empty(4), np.empty(3)
     mujoco.mju_mat2Quat(quaternion, rotation.ravel())
@@ -159,8 +158,10 @@ def rotation_matrix(vector: F64) -> F64:
 
 
 def hand_down(yaw: float) -> F64:
-    """Return the rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the
-    world's z; (3, 3).
+    """Return the rotation of `ee` with the hand pointing down, (3, 3).
+
+    Args:
+        yaw: Turn of the hand about the world's z [rad].
     """
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
@@ -195,8 +196,10 @@ def angle_ahead(rotation: F64) -> float:
 
 
 def angle_across(rotation: F64) -> float:
-    """Return the yaw [rad] of a hand (3, 3), which may lean, from the direction in which its
-    fingers move.
+    """Return the yaw [rad] of a hand from the direction in which its fingers move.
+
+    Args:
+        rotation: Rotation of the hand, which may lean, (3, 3).
     """
     return math.atan2(rotation[0, 1], -rotation[1, 1])
 

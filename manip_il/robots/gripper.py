@@ -124,8 +124,11 @@ class Gripper:
         return self._closed + float(np.interp(opening, openings, shares)) * self._travel
 
     def put(self, data: mujoco.MjData, opening: float) -> None:
-        """Place the fingers, with their linkage if there is one, at an opening [m], and command
-        that opening.
+        """Place the fingers, with their linkage if there is one, and command them to stay there.
+
+        Args:
+            data: Data of the gripper's model, changed in place.
+            opening: Opening of the gripper [m].
         """
         data.qpos[self.q] = data.ctrl[self.ctrl] = self.command(opening)
         for at, positions in self._linked:
@@ -140,12 +143,13 @@ class Gripper:
         return self._sweep.openings, self._closed[0] + self._sweep.shares * self._travel[0]
 
     def middle(self, opening: float) -> float:
-        """Return the offset [m] of the pads' midpoint along the hand's y at an opening [m].
+        """Return the offset [m] of the midpoint between the pads along the hand's y.
 
-        0 if all fingers move.
+        It is 0 if all fingers move. If one jaw is fixed and the other turns or slides, a held
+        object ends up beside the fixed one.
 
-        If one jaw is fixed and the other turns or slides, a held object ends up beside the fixed
-        one.
+        Args:
+            opening: Opening of the gripper [m].
         """
         return (
             float(np.interp(opening, self._sweep.openings, self._sweep.middles))
@@ -154,8 +158,11 @@ class Gripper:
         )
 
     def commanded(self, commands: F64, before: F64) -> float:
-        """Return the opening [m] that `commands` (g,) ask for, by the one farthest from its
-        value in `before` (g,).
+        """Return the opening [m] that commands ask for, by the one that changed most.
+
+        Args:
+            commands: The driven joints' commands, (g,).
+            before: Their commands before, (g,).
         """
         shares = (commands - self._closed) / self._travel
         moved = np.abs(shares - (before - self._closed) / self._travel)
@@ -181,7 +188,8 @@ class Gripper:
 def sweep(robot: Robot) -> Sweep:
     """Move a robot's gripper from closed to open and measure where the fingers come to rest.
 
-    Raises `UsageError` if they do not come apart.
+    Raises:
+        UsageError: If the fingers touch when open, or do not come apart.
     """
     spec = arm_spec(robot)
     set_time_step(spec)
@@ -262,8 +270,9 @@ def sweep(robot: Robot) -> Sweep:
 
 
 def set_time_step(spec: mujoco.MjSpec) -> None:
-    """Give a gripper that is simulated alone a time step and an integrator that stiff linkages
-    bear.
+    """Set a time step and an integrator that stiff linkages bear.
+
+    They are for a gripper that is simulated alone.
     """
     spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 

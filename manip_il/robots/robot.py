@@ -180,8 +180,10 @@ class LeRobotConfig:
             )
 
     def percent(self, joint: F64) -> F64:
-        """Return the gripper's positions, 0 to 100, for positions `joint` of its driven joint
-        [rad].
+        """Return the gripper's positions, 0 to 100.
+
+        Args:
+            joint: Positions of the gripper's driven joint [rad].
         """
         at_0, at_100 = self.gripper
         return 100 * (joint - at_0) / (at_100 - at_0)
@@ -259,9 +261,7 @@ class Robot:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the entries of `observation.state` and `action`: arm joints, then the
-        gripper.
-        """
+        """Names of the entries of an action or a state: arm joints, then the gripper."""
         return self.lerobot.names if self.lerobot is not None else (*self.joints, "gripper")
 
     @property
@@ -271,14 +271,10 @@ class Robot:
 
     @property
     def faces_ahead(self) -> bool:
-        """Whether yaw 0 of the hand points away from the shoulder, rather than along the world's
-        x.
-        """
+        """Whether yaw 0 of the hand points away from the shoulder, not along the world's x."""
         return self.yaw != "world"
 
     @property
     def leans(self) -> bool:
-        """Whether the hand leans everywhere, as the arm has too few joints to point it straight
-        down.
-        """
+        """Whether the hand leans everywhere, as too few joints cannot point it straight down."""
         return self.costs.orientation == self.costs.leaning

@@ -136,10 +136,12 @@ def arm_joints(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig)
 
 
 def arm_spec(robot: Robot) -> mujoco.MjSpec:
-    """Return the arm and gripper as a spec: position-controlled, with the site `ee`, and nothing
-    else.
+    """Return the arm and gripper as a spec.
 
-    Raises `UsageError` naming the joint, body or file that is missing, and those that exist.
+    It is position-controlled, with the site `ee`, and has nothing else.
+
+    Raises:
+        UsageError: If a joint, body or file is missing; the message names it, and those that exist.
     """
     camera = robot.wrist_camera if isinstance(robot.wrist_camera, str) else ""
     spec = bare_spec(robot.name, robot.files, robot.hand, robot.gripper, camera)
@@ -233,8 +235,13 @@ def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -
 
 
 def linkage(spec: mujoco.MjSpec, robot: Robot) -> list[str]:
-    """Return the names of the joints beyond the hand that nothing drives or fixes: those of the
-    gripper's linkage.
+    """Return the names of the joints of the gripper's linkage.
+
+    These are the joints beyond the hand that nothing drives or fixes.
+
+    Args:
+        spec: The robot's model.
+        robot: The robot.
     """
     apart = {*robot.joints, *robot.gripper.joints, *robot.fixed}
     below = spec.body(robot.hand).find_all("joint")
@@ -339,8 +346,13 @@ def _remove_scene_elements(spec: mujoco.MjSpec, hand: str = "", kept: str = "") 
 
 
 def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
-    """Copy physics options from one spec to another: MuJoCo warns if two specs that it joins
-    have different ones.
+    """Copy physics options from one spec to another.
+
+    MuJoCo warns if two specs that it joins have different ones.
+
+    Args:
+        origin: The spec to copy from.
+        spec: The spec to change.
     """
     for name in dir(origin.option):
         if not name.startswith("_"):

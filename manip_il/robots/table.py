@@ -54,7 +54,14 @@ def is_robot(name: str) -> bool:
 
 
 def read_robot(path: Path) -> Robot:
-    """Read a robot's YAML. Raises `UsageError` naming the file and what is wrong in it."""
+    """Read a robot's YAML.
+
+    Args:
+        path: Path of the YAML.
+
+    Raises:
+        UsageError: If something in it is wrong; the message names the file and what is wrong.
+    """
     try:
         if path.stem in ROBOTS and path.resolve() != ROBOTS[path.stem].resolve():
             raise ManipError(f"a built-in robot is called {path.stem}; rename the file")

@@ -119,7 +119,7 @@ class Condition:
     Each range is (low, high), both ends included, or a single number.
 
     Args:
-        name: The condition's name, which must also do as a file name.
+        name: The condition's name, which must be usable as a file name.
         action_noise: Standard deviation of Gaussian noise on every executed action, as a share of
             its full range.
         random_actions: Share of control steps at which a random action is executed, each joint
@@ -194,8 +194,10 @@ class Condition:
         return Condition(self.name, **kept)
 
     def only(self, changes: str) -> Condition:
-        """Return the condition with only the ranges that change one thing, see
-        `Quantity.changes`.
+        """Return the condition with only the ranges that change one thing.
+
+        Args:
+            changes: What they change, as in `Quantity.changes`.
         """
         kept = {
             name: range_ for name, range_ in self.ranges.items() if RANGES[name].changes == changes
@@ -203,12 +205,14 @@ class Condition:
         return Condition(self.name, **kept)
 
     def draw(self, seed: int) -> dict[str, Any]:
-        """Return the values drawn for the episode of a seed, by the names of the ranges and in
-        their units.
+        """Return the values drawn for an episode, by the names of the ranges and in their units.
 
         Each value has a random stream of its own, so that adding a range leaves the other values
         unchanged. camera_shift and camera_turn have one vector (3,) per camera, in the camera's own
         frame.
+
+        Args:
+            seed: Seed of the episode.
         """
         return {
             name: RANGES[name].draw(rng_for(seed, f"condition {name}"), range_)

@@ -233,8 +233,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return executed
 
     def simulate(self) -> None:
-        """Run one control step with the actuators' commands as they are, as `advance` does once
-        it has set them.
+        """Run one control step with the actuators' commands as they are.
+
+        `advance` calls this once it has set them.
         """
         self._begin_step()
         mujoco.mj_step(self.world.model, self.data, self.config.physics_steps)
@@ -246,9 +247,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     @property
     def solved(self) -> bool:
-        """Whether the task is solved: it has been within the tolerance for the required number
-        of steps in a row.
-        """
+        """Whether the task has been within its tolerance for enough steps in a row."""
         return self._streak >= self.config.success_steps
 
     @property
@@ -266,8 +265,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return min(1.0, max(0.0, self._task.progress(self.world)))
 
     def get_state(self) -> State:
-        """Return everything that the world's future depends on, which `set_state` restores bit
-        for bit.
+        """Return everything that the world's future depends on.
+
+        `set_state` restores it bit for bit.
         """
         return State(
             self.world.physics(),
@@ -282,9 +282,11 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def set_state(self, state: State) -> None:
         """Restore a state of the same scene.
 
-        One without a seed goes on with the events of the current episode.
+        Args:
+            state: The state; one without a seed goes on with the events of the current episode.
 
-        Raises `MismatchError` for a state of another scene.
+        Raises:
+            MismatchError: If the state is one of another scene.
         """
         self.world.restore(state.physics, state.variation)
         if state.seed is not None:

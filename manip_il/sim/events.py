@@ -131,8 +131,10 @@ def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None
 
 
 def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
-    """Return (geom, geom, False) for each contact of the robot, and (geom, geom, True), too, if
-    the geoms overlap.
+    """Return the contacts of the robot with anything, by their geoms.
+
+    Returns:
+        (geom, geom, False) for each contact and, if the geoms overlap, (geom, geom, True), too.
     """
     model, contact = world.scene.model, world.data.contact
     robot = model.body_rootid[model.site_bodyid[world.scene.ee_site]]
@@ -180,8 +182,10 @@ class Perturbation(Condition):
         vars(self).update(moments=moments)
 
     def draw(self, seed: int) -> dict[str, Any]:
-        """Return the kind's name -> the control step at which it happens in the episode of a
-        seed.
+        """Return the kind's name -> the control step at which it happens.
+
+        Args:
+            seed: Seed of the episode.
         """
         return {self.name: self.moments[seed]}
 
@@ -232,8 +236,11 @@ class Events:
         return False
 
     def action(self, action: F64, step: int) -> F64:
-        """Return the action (n,) that is executed at a step: `action`, with noise or replaced if
-        an event says so.
+        """Return the action that is executed at a step, (n,).
+
+        Args:
+            action: The action of the policy, (n,); an event may add noise to it, or replace it.
+            step: The control step.
         """
         name, kind = self._kinds.get(step, ("", None))
         if kind is not None and kind.wrong is not None:

@@ -86,7 +86,15 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
 
 
 def camera_id(model: mujoco.MjModel, name: str) -> int:
-    """Return the id of a camera of the world or on the robot. Raises `UnknownName`."""
+    """Return the id of a camera of the world or on the robot.
+
+    Args:
+        model: The compiled scene.
+        name: Name of the camera, without the robot's prefix.
+
+    Raises:
+        UnknownName: If there is no such camera.
+    """
     for prefix in ("", PREFIX):
         camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, prefix + name)
         if camera >= 0:

@@ -168,10 +168,9 @@ class ObjectShape:
 
     @property
     def sizes(self) -> tuple[float, float] | None:
-        """Range of `2 * max(size)` [m] in which the object, scaled as a whole, can be grasped
-        however it lies.
+        """Range of `2 * max(size)` [m] in which the object can be grasped however it lies.
 
-        None if that range is empty.
+        The object is scaled as a whole. None if that range is empty.
         """
         if self.mesh is not None:
             return None
@@ -196,15 +195,21 @@ def _lengths(
 
 
 def draws_shape(text: NameOrPath) -> bool:
-    """Return whether `text`, as in `ObjectShape.parse`, asks for a shape that is drawn anew in
-    each episode.
+    """Return whether an object's shape is drawn anew in each episode.
+
+    Args:
+        text: The object, as in `ObjectShape.parse`.
     """
     return str(text).partition(":")[0] == ANY
 
 
 def stored(text: NameOrPath) -> str:
-    """Return an object's text as datasets store it: for a mesh, with the file's name and hash in
-    place of its path.
+    """Return an object's text as datasets store it.
+
+    For a mesh, the file's name and hash replace its path.
+
+    Args:
+        text: The object, as in `ObjectShape.parse`.
     """
     return str(ObjectShape.parse(text)) if isinstance(text, Path) else text
 

@@ -67,15 +67,24 @@ def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
 
 
 def part(variation: F64, name: str) -> F64:
-    """Return the numbers of one quantity of `RANGES`, such as `table` or `clutter`, in a
-    variation (v,).
+    """Return the numbers of one quantity in a variation.
+
+    Args:
+        variation: The variation, (v,).
+        name: A name in `RANGES`, such as `table` or `clutter`.
     """
     return _world(variation)[RANGES[name].places]
 
 
 def seen_objects(variation: F64) -> tuple[F64, int | None]:
-    """Return `geom_size` of all objects, (o, 3) [m], and their MuJoCo geom type, None unless a
-    shape was drawn.
+    """Return the sizes of all objects and their shape.
+
+    Args:
+        variation: The variation, (v,).
+
+    Returns:
+        `geom_size` of each object, (o, 3) [m], and MuJoCo's geom type of all, None unless a shape
+        was drawn.
     """
     shape = float(_world(variation)[_SHAPE])
     return _objects(variation)[:, _SIZE], None if shape == OWN else int(shape)
@@ -95,12 +104,15 @@ def same_physics(variation: F64, other: F64) -> bool:
 
 
 def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
-    """Return `base` (v,) with the values in `drawn`, whose names and units are those of
-    `Condition`.
+    """Return a variation with the values that a condition drew, (v,).
 
-    Names of other quantities change nothing. size is the edge or width [m]. An object of a drawn
-    shape has the mass of a wooden one, unless a mass is drawn. camera_shift and camera_turn have a
-    vector (3,) per camera.
+    An object of a drawn shape has the mass of a wooden one, unless a mass is drawn.
+
+    Args:
+        base: The variation to start from, (v,).
+        drawn: Values, by the names and in the units of `Condition`; size is the edge or width [m],
+            and camera_shift and camera_turn have a vector (3,) per camera. Names of other
+            quantities change nothing.
     """
     varied = base.copy()
     rows, world = _objects(varied), _world(varied)

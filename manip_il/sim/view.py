@@ -75,8 +75,12 @@ class ViewModel:
         self._applied = scene.nominal
 
     def apply(self, variation: F64) -> None:
-        """Apply the look of a variation (v,) to the next pictures, without uploading anything to
-        the graphics card.
+        """Apply the look of a variation to the next pictures.
+
+        Nothing is uploaded to the graphics card.
+
+        Args:
+            variation: The variation, (v,).
         """
         if np.array_equal(variation, self._applied):
             return

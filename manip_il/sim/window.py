@@ -36,8 +36,12 @@ def has_display() -> bool:
 
 
 def require_display() -> None:
-    """Raise `RenderError` if no window can be opened: MuJoCo's viewer would end the process, or
-    wait forever.
+    """Check that a window can be opened.
+
+    Without this, MuJoCo's viewer would end the process, or wait forever.
+
+    Raises:
+        RenderError: If no window can be opened.
     """
     import glfw  # MuJoCo's own
 
@@ -129,8 +133,9 @@ class Window:
 
     @property
     def commands(self) -> F64:
-        """Positions of the control sliders, in the actuators' units, (u,): as shown last, or as
-        moved since.
+        """Positions of the control sliders, in the actuators' units, (u,).
+
+        They are as shown last, or as moved since.
         """
         return self._data.ctrl.copy()
 

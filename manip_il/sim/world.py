@@ -95,9 +95,7 @@ class Scene:
 
     @cached_property
     def furniture(self) -> I64:
-        """The numbers of the geoms of mocap bodies, (g,): goal markers and the fixed parts of
-        the task.
-        """
+        """Ids of the geoms of mocap bodies, (g,): goal markers and the fixed parts of the task."""
         return np.flatnonzero(
             self.model.body_mocapid[self.model.body_rootid[self.model.geom_bodyid]] >= 0
         )
@@ -238,7 +236,14 @@ class World:
         return self._cache[key]
 
     def pose(self, name: str) -> Pose:
-        """Return the pose of a body, as views that follow the world. Raises `UnknownName`."""
+        """Return the pose of a body, as views that follow the world.
+
+        Args:
+            name: Name of the body.
+
+        Raises:
+            UnknownName: If there is no body of this name.
+        """
         pose = self._poses.get(name)
         if pose is None:
             body = self._body(name).id
@@ -345,11 +350,14 @@ class World:
         )
 
     def neighbours(self, name: str) -> list[tuple[float, float]]:
-        """Return the offsets (x, y) [m] from an object's centre to the nearest point of each
-        neighbour within 8 cm.
+        """Return the offsets (x, y) [m] from an object to its neighbours within 8 cm.
 
-        Neighbours are furniture and other objects that a hand over the object could hit, taken as
-        axis-aligned boxes.
+        Each is from the object's centre to the nearest point of the neighbour. Neighbours are
+        furniture and other objects that a hand over the object could hit, taken as axis-aligned
+        boxes.
+
+        Args:
+            name: Name of the object.
         """
         others = self._standing[name]
         if not len(others):
