@@ -12,26 +12,39 @@ from manip_il.mdp import F64
 
 @dataclass(frozen=True, eq=False)
 class ServoUnits:
-    """Conversion of joints [rad] and a gripper opening [m] to servo units (degrees.
+    """Conversion of joints [rad] and a gripper opening [m] to servo units and back.
 
-    Gripper 0 to 100) and back.
+    Servo units are degrees for a joint, and 0 to 100 for the gripper.
 
-    openings: gripper openings [m], rising, (c,). percents: the gripper servo's positions at these,
-    0 to 100, (c,).
+    Attributes:
+        openings: Gripper openings [m], rising, (c,).
+        percents: Positions of the gripper's servo at these, 0 to 100, (c,).
     """
 
     openings: F64
     percents: F64
 
     def of(self, arm: F64, opening: float) -> tuple[F64, float]:
-        """Return degrees (n - 1,) and gripper position, 0 to 100, for joints (n - 1,) [rad] and
-        an opening [m].
+        """Convert joints and a gripper opening to servo units.
+
+        Args:
+            arm: Joints, (n - 1,) [rad].
+            opening: Opening of the gripper [m].
+
+        Returns:
+            The joints, (n - 1,) [deg], and the gripper's position, 0 to 100.
         """
         return np.degrees(arm), float(np.interp(opening, self.openings, self.percents))
 
     def back(self, arm: F64, percent: float) -> tuple[F64, float]:
-        """Return joints (n - 1,) [rad] and opening [m] for degrees (n - 1,) and gripper
-        position, 0 to 100.
+        """Convert servo units to joints and a gripper opening.
+
+        Args:
+            arm: Joints, (n - 1,) [deg].
+            percent: Position of the gripper, 0 to 100.
+
+        Returns:
+            The joints, (n - 1,) [rad], and the opening of the gripper [m].
         """
         order = np.argsort(self.percents)  # rising, as `interp` needs them
         return np.radians(arm), float(
@@ -41,14 +54,19 @@ class ServoUnits:
 
 @dataclass(frozen=True, eq=False)
 class ActionSpace:
-    """Names and bounds of an action (n,): joint targets [rad] and, last in `names`, the gripper's
-    opening [m].
+    """Names and bounds of an action (n,): joint targets [rad], then the gripper's opening [m].
 
-    low, high: what commands are clipped to, infinite for a joint that turns freely. scale: for a
-    joint the largest step of its target from its measured position [rad], for the gripper the range
-    of its opening [m]. relative: whether a learner's target is relative to the measured position:
-    true except for the gripper. units: set for a robot with servos; low, high, scale, actions and
-    measured states are then in degrees, the gripper's from 0 to 100.
+    Attributes:
+        names: Names of the entries; the gripper is last.
+        low: Least command, to which others are clipped, (n,); infinite for a joint that turns
+            freely.
+        high: Greatest command, likewise, (n,).
+        scale: For a joint, the largest step of its target from its measured position [rad]; for the
+            gripper, the range of its opening [m]; (n,).
+        relative: Whether a learner's target is relative to the measured position, (n,); true except
+            for the gripper.
+        units: Set for a robot with servos; `low`, `high`, `scale`, actions and measured states are
+            then in degrees, the gripper's from 0 to 100.
     """
 
     names: tuple[str, ...]
@@ -64,8 +82,11 @@ class ActionSpace:
         return len(self.names)
 
     def join(self, arm: F64, opening: float) -> F64:
-        """Return the action, or measured state, (n,) for joint values (n - 1,) [rad] and an
-        opening [m].
+        """Return the action, or measured state, of joints and an opening, (n,).
+
+        Args:
+            arm: Joints, (n - 1,) [rad].
+            opening: Opening of the gripper [m].
         """
         if self.units is not None:
             arm, opening = self.units.of(arm, opening)
@@ -80,9 +101,15 @@ class ActionSpace:
         return (arm, gripper) if self.units is None else self.units.back(arm, gripper)
 
     def clip(self, action: NDArray[np.floating], step: int) -> F64:
-        """Clip `action` (n,) to the bounds.
+        """Clip an action to the bounds.
 
-        Raises `MismatchError` for a wrong shape, `NotFiniteError` for NaN.
+        Args:
+            action: The action, (n,).
+            step: The control step, for messages.
+
+        Raises:
+            MismatchError: If the action has the wrong shape.
+            NotFiniteError: If it has NaN or infinite entries.
         """
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self.low.shape:
@@ -94,8 +121,11 @@ class ActionSpace:
         return np.clip(action, self.low, self.high)
 
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
-        """Draw an action (n,): joint targets within `scale` of the measured `state` (n,), and
-        any gripper opening.
+        """Draw an action (n,) near a state, with any gripper opening.
+
+        Args:
+            state: Measured joints and opening, (n,); the joint targets are within `scale` of it.
+            rng: Generator to draw from.
         """
         action = np.array(state, dtype=np.float64)
         action[self.arm] += rng.uniform(-1, 1, len(action) - 1) * self.scale[self.arm]

@@ -24,9 +24,11 @@ KEYS = ("model", "includes", "meshes", "mend")  # keys of `ModelFiles` in a YAML
 class ModelFiles:
     """An MJCF and what it needs; paths are absolute.
 
-    includes: the folder of the files that the model includes; the model is read as if it lay there.
-    meshes: the folder of its meshes. mend: texts in the file and their replacements, for
-    third-party files that do not compile.
+    Attributes:
+        model: The MJCF.
+        includes: Folder of the files that the model includes; the model is read as if it lay there.
+        meshes: Folder of its meshes.
+        mend: Texts in the file and their replacements, for third-party files that do not compile.
     """
 
     model: Path
@@ -36,9 +38,15 @@ class ModelFiles:
 
     @classmethod
     def read(cls, what: str, tree: Mapping[str, Any], folder: Path) -> Self:
-        """Return the files that a YAML in `folder` names. what: prefix of its keys in messages.
+        """Return the files that a YAML names.
 
-        Raises `ManipError`.
+        Args:
+            what: Prefix of the YAML's keys in messages.
+            tree: The YAML's part with the keys in `KEYS`; all but `model` may be missing.
+            folder: The YAML's folder, to which paths are relative.
+
+        Raises:
+            ManipError: If a value is not a text, or names a package that is not installed.
         """
         places = {
             key: place(what + key, tree[key], folder)
@@ -50,9 +58,12 @@ class ModelFiles:
     def load(self, robot: str) -> mujoco.MjSpec:
         """Read the model with its included files and its meshes.
 
-        Raises `UsageError` if it cannot be read.
+        Args:
+            robot: The robot's name, for messages.
 
-        robot: its name.
+        Raises:
+            UsageError: If a file cannot be read, the model has no joints, or `mend` names a text
+                that the file does not have.
         """
         mujoco.set_mju_user_warning(_warn)
         try:
@@ -115,11 +126,20 @@ def _warn(text: str) -> None:
 
 
 def read(what: str, kind: Any, value: Any) -> Any:
-    """Convert a YAML's value to the type `kind`: a dataclass (keys are its fields), tuple, mapping,
-    number or text.
+    """Convert a YAML's value to a type.
 
-    what: the value's name in messages. Raises `UnknownName` for an unknown key, `ManipError` for a
-    value that is missing, of the wrong type or invalid.
+    Args:
+        what: The value's name in messages.
+        kind: A dataclass (the YAML's keys are its fields), or the type of a tuple, mapping, number
+            or text.
+        value: The value as the YAML has it.
+
+    Returns:
+        The value, an instance of `kind`.
+
+    Raises:
+        UnknownName: If the YAML has a key that the dataclass does not have.
+        ManipError: If a value is missing, invalid or of the wrong type.
     """
     import draccus  # imported here, as listing the robots does not need it
 
@@ -139,8 +159,14 @@ def read(what: str, kind: Any, value: Any) -> Any:
 
 
 def require_lengths(one: Any, **counts: int) -> None:
-    """Raise `ManipError` if a field of `one` does not have the number of values that `counts`
-    gives for it.
+    """Check how many values the fields of an object have.
+
+    Args:
+        one: The object.
+        counts: Number of values that each field must have, by the field's name.
+
+    Raises:
+        ManipError: If a field has another number of values.
     """
     for name, count in counts.items():
         if len(getattr(one, name)) != count:
@@ -148,8 +174,15 @@ def require_lengths(one: Any, **counts: int) -> None:
 
 
 def place(what: str, value: Any, folder: Path) -> Path:
-    """Return the path of `PATH`, relative to the YAML's folder, or of `PACKAGE:PATH`, in an
-    installed package.
+    """Return the path of a file or folder that a YAML names.
+
+    Args:
+        what: The value's name in messages.
+        value: `PATH`, relative to the YAML's folder, or `PACKAGE:PATH`, in an installed package.
+        folder: The YAML's folder.
+
+    Raises:
+        ManipError: If the value is not a text, or the package is not installed.
     """
     package, colon, path = checks.text(what, value).partition(":")
     if not colon:

@@ -45,9 +45,13 @@ _DIGITS = 4  # decimals of a posture [rad]
 
 
 def complete(said: dict[str, Any]) -> Robot:
-    """Complete a YAML's fields from the robot's model; return the robot.
+    """Complete a YAML's fields from the robot's model, and return the robot.
 
-    Raises `UsageError` for a field not found.
+    Args:
+        said: The fields of `Robot` that the YAML gives.
+
+    Raises:
+        UsageError: If a field cannot be found in the model.
     """
     name, names = said["name"], said["joints"]
     spec = bare_spec(name, said["files"], said["hand"], said["gripper"])
@@ -86,8 +90,9 @@ def _greatest_torque(motor: Any, joint: Any) -> float:
 
 
 def find_gains(robot: Robot) -> tuple[float, ...]:
-    """Return each joint's kp [N m/rad] for a natural frequency of 6 Hz with its inertia in the
-    home posture.
+    """Return each joint's kp [N m/rad] for a natural frequency of 6 Hz at home.
+
+    With the joint's inertia I [kg m^2] in the home posture, kp = (2 pi 6 Hz)^2 I.
     """
     model = arm_spec(robot).compile()
     data = mujoco.MjData(model)
@@ -101,11 +106,13 @@ def find_gains(robot: Robot) -> tuple[float, ...]:
 
 
 def find_ee(robot: Robot) -> EndEffector:
-    """Return the frame between the fingertips: z from the hand to them, y along the fingers'
-    motion.
+    """Return the frame between the fingertips.
 
-    z is snapped to the nearest axis of the hand's body; y, too, if it is nearly parallel to one.
-    Raises `UsageError` if the fingers do not come apart.
+    Its z points from the hand to the fingertips, and its y along the fingers' motion. z is snapped
+    to the nearest axis of the hand's body; y, too, if it is nearly parallel to one.
+
+    Raises:
+        UsageError: If the fingers do not come apart.
     """
     model, data = _settled(robot, _AT_OBJECT)
     hand = data.body(robot.hand)
@@ -178,11 +185,16 @@ def _along_axis(vector: F64, least: float = 0.0) -> F64:
 
 
 def find_home(robot: Robot, turns: bool) -> Robot:
-    """Return the robot with `home` set to its best posture for a hand that points down over the
-    workspace's middle.
+    """Return the robot with `home` set to its best posture.
 
-    turns: whether `ee` may be turned by half a turn about z if that suits the arm better. Raises
-    `UsageError` if inverse kinematics converges from none of forty random postures.
+    In that posture the hand points down over the workspace's middle.
+
+    Args:
+        robot: The robot.
+        turns: Whether `ee` may be turned by half a turn about z if that suits the arm better.
+
+    Raises:
+        UsageError: If inverse kinematics converges from none of forty random postures.
     """
     halves = (robot, replace(robot, ee=_half_turned(robot.ee))) if turns else (robot,)
     highest = min(_HIGHEST, robot.workspace.height / 2)

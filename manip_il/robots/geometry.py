@@ -23,8 +23,14 @@ _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> F64:
-    """Return points around a geom in the world, (n, 3) [m]: its mesh's vertices, or its box's
-    corners.
+    """Return points around a geom in the world, (n, 3) [m].
+
+    They are the vertices of its mesh, or else the corners of its box.
+
+    Args:
+        model: The compiled model.
+        data: Its data, with up-to-date kinematics.
+        geom: Id of the geom.
     """
     mesh = int(model.geom_dataid[geom])
     middle = model.geom_aabb[geom, :3]
@@ -40,8 +46,13 @@ def outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> F64:
 def at_tip(
     model: mujoco.MjModel, data: mujoco.MjData, finger: Sequence[int], along: F64
 ) -> list[int]:
-    """Return the geoms of a finger that extend nearly to its tip. along: the finger's direction
-    in the world, (3,).
+    """Return the geoms of a finger that extend nearly to its tip.
+
+    Args:
+        model: The compiled model.
+        data: Its data, with up-to-date kinematics.
+        finger: Ids of the finger's geoms.
+        along: Direction in which the finger points, a unit vector in the world, (3,).
     """
     ends = {geom: float((outline(model, data, geom) @ along).max()) for geom in finger}
     return [geom for geom in finger if ends[geom] > max(ends.values()) - _AT_TIP]
@@ -50,11 +61,17 @@ def at_tip(
 def distance(
     model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, ends: F64 | None = None
 ) -> float:
-    """Return the distance between two geoms [m], at most 1 m, and put their nearest points (6,) [m]
-    into `ends`.
+    """Return the distance between two geoms [m], at most 1 m.
 
     MuJoCo sometimes returns exactly 0 for two separate geoms: `one` is then shifted slightly and
     measured again.
+
+    Args:
+        model: The compiled model.
+        data: Its data, with up-to-date kinematics.
+        one: Id of a geom.
+        other: Id of the other geom.
+        ends: If given, overwritten with the nearest points of `one` and `other`, (6,) [m].
     """
     place = data.geom_xpos[one].copy()
     apart = 0.0
@@ -70,8 +87,15 @@ def distance(
 def nearest(
     model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[Sequence[int]]
 ) -> tuple[tuple[int, int], F64]:
-    """Return the nearest pair of a geom in the first group and one in another, with their
-    nearest points (2, 3) [m].
+    """Find the nearest pair of a geom in the first group and one in another group.
+
+    Args:
+        model: The compiled model.
+        data: Its data, with up-to-date kinematics.
+        groups: Ids of the geoms of two groups or more, such as fingers.
+
+    Returns:
+        The ids of the two geoms, and the nearest points on them, (2, 3) [m].
     """
     first, *rest = groups
     least = np.inf
@@ -88,9 +112,7 @@ def nearest(
 
 
 class Body:
-    """A robot with its gripper open, to detect self-collisions other than those in its home
-    posture.
-    """
+    """A robot with its gripper open, to detect self-collisions that do not occur at home."""
 
     def __init__(self, robot: Robot):
         self._model = arm_spec(robot).compile()
@@ -117,8 +139,9 @@ class Body:
 
 
 def rotation_vector(rotation: F64) -> F64:
-    """Return the rotation vector (3,), axis times angle [rad], at most pi long, of a rotation
-    matrix (3, 3).
+    """Return the rotation vector of a rotation matrix (3, 3): axis times angle, (3,) [rad].
+
+    It is at most pi long.
     """
     quaternion, vector = np.empty(4), np.empty(3)
     mujoco.mju_mat2Quat(quaternion, rotation.ravel())
@@ -135,8 +158,10 @@ def rotation_matrix(vector: F64) -> F64:
 
 
 def hand_down(yaw: float) -> F64:
-    """Return the rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the
-    world's z; (3, 3).
+    """Return the rotation of `ee` with the hand pointing down, (3, 3).
+
+    Args:
+        yaw: Turn of the hand about the world's z [rad].
     """
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
@@ -149,9 +174,14 @@ def turn_about_z(yaw: float) -> F64:
 
 
 def yaw_ahead(robot: Robot, shoulder: F64, position: F64) -> float:
-    """Return the world yaw [rad] that counts as zero for a hand at `position`.
+    """Return the world yaw [rad] that counts as zero for the hand.
 
-    Shoulder, position: (3,) [m].
+    It is 0 unless the robot's zero yaw points away from the shoulder (`Robot.faces_ahead`).
+
+    Args:
+        robot: The robot.
+        shoulder: Position of the arm's first joint, (3,) [m].
+        position: Position of the hand, (3,) [m].
     """
     return (
         math.atan2(position[1] - shoulder[1], position[0] - shoulder[0])
@@ -166,8 +196,10 @@ def angle_ahead(rotation: F64) -> float:
 
 
 def angle_across(rotation: F64) -> float:
-    """Return the yaw [rad] of a hand (3, 3), which may lean, from the direction in which its
-    fingers move.
+    """Return the yaw [rad] of a hand from the direction in which its fingers move.
+
+    Args:
+        rotation: Rotation of the hand, which may lean, (3, 3).
     """
     return math.atan2(rotation[0, 1], -rotation[1, 1])
 
@@ -195,8 +227,12 @@ def angle_between(a: F64, b: F64) -> float:
 
 
 def turned_towards(rotation: F64, target: F64, largest: float) -> F64:
-    """Return `rotation` (3, 3) turned towards `target` along the shortest path, by at most
-    `largest` [rad].
+    """Return a rotation turned towards another along the shortest path, (3, 3).
+
+    Args:
+        rotation: Rotation to start from, (3, 3).
+        target: Rotation to turn towards, (3, 3).
+        largest: Largest angle to turn by [rad]; the target itself is returned if it is no farther.
     """
     if angle_between(rotation, target) <= largest:
         return target

@@ -34,14 +34,18 @@ _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Measured relation between command and opening.
+    """Measured relation between command and opening, at c commands.
 
-    shares: how far the driven joints are, or are commanded to be, from closed (0) to open (1);
-    rising, (c,). openings: gaps between the pads at these [m], rising, (c,). middles: offsets along
-    the hand's y of the midpoint between the pads [m], (c,); all 0 if both sides move alike. pads:
-    for each finger, the indices of its pads among its geoms, nearest to the other finger first.
-    holding: for each finger, the indices of the geoms that may hold an object. linked: positions of
-    a linkage's undriven joints, by name, (c,).
+    Attributes:
+        shares: How far the driven joints are, or are commanded to be, from closed (0) to open (1);
+            rising, (c,).
+        openings: Gaps between the pads at these [m], rising, (c,).
+        middles: Offsets along the hand's y of the midpoint between the pads [m], (c,); all 0 if
+            both sides move alike.
+        pads: For each finger, the indices of its pads among its geoms, nearest to the other finger
+            first.
+        holding: For each finger, the indices of the geoms that may hold an object.
+        linked: Positions of a linkage's undriven joints, by name, (c,).
     """
 
     shares: F64
@@ -53,11 +57,29 @@ class Sweep:
 
 
 class Gripper:
-    """A robot's gripper within a compiled model. prefix: prefix of the robot's names in the
-    model.
+    """A robot's gripper within a compiled model.
+
+    Attributes:
+        q: Indices of the g driven joints into `qpos`, (g,).
+        ctrl: Indices of their actuators into `ctrl`, (g,).
+        geoms: Ids of all geoms of the fingers that have contacts.
+        pads: For each finger, the ids of its pads, nearest to the other finger first.
+        lopsided: Whether one jaw is fixed, so that the midpoint between the pads moves.
+        least: Opening of the closed gripper [m].
+        most: Opening of the open gripper [m].
     """
 
     def __init__(self, robot: Robot, model: mujoco.MjModel, prefix: str = ""):
+        """Find the gripper's joints, actuators and geoms in the model.
+
+        Args:
+            robot: The robot.
+            model: A compiled model that contains the robot.
+            prefix: Prefix of the robot's names in the model.
+
+        Raises:
+            UsageError: If the fingers do not come apart, or one has no geom with contacts.
+        """
         config, self._sweep = robot.gripper, sweep(robot)
         self.q = np.array(
             [model.joint(prefix + name).qposadr[0] for name in config.joints], dtype=np.int64
@@ -102,8 +124,11 @@ class Gripper:
         return self._closed + float(np.interp(opening, openings, shares)) * self._travel
 
     def put(self, data: mujoco.MjData, opening: float) -> None:
-        """Place the fingers, with their linkage if there is one, at an opening [m], and command
-        that opening.
+        """Place the fingers, with their linkage if there is one, and command them to stay there.
+
+        Args:
+            data: Data of the gripper's model, changed in place.
+            opening: Opening of the gripper [m].
         """
         data.qpos[self.q] = data.ctrl[self.ctrl] = self.command(opening)
         for at, positions in self._linked:
@@ -118,12 +143,13 @@ class Gripper:
         return self._sweep.openings, self._closed[0] + self._sweep.shares * self._travel[0]
 
     def middle(self, opening: float) -> float:
-        """Return the offset [m] of the pads' midpoint along the hand's y at an opening [m].
+        """Return the offset [m] of the midpoint between the pads along the hand's y.
 
-        0 if all fingers move.
+        It is 0 if all fingers move. If one jaw is fixed and the other turns or slides, a held
+        object ends up beside the fixed one.
 
-        If one jaw is fixed and the other turns or slides, a held object ends up beside the fixed
-        one.
+        Args:
+            opening: Opening of the gripper [m].
         """
         return (
             float(np.interp(opening, self._sweep.openings, self._sweep.middles))
@@ -132,8 +158,11 @@ class Gripper:
         )
 
     def commanded(self, commands: F64, before: F64) -> float:
-        """Return the opening [m] that `commands` (g,) ask for, by the one farthest from its
-        value in `before` (g,).
+        """Return the opening [m] that commands ask for, by the one that changed most.
+
+        Args:
+            commands: The driven joints' commands, (g,).
+            before: Their commands before, (g,).
         """
         shares = (commands - self._closed) / self._travel
         moved = np.abs(shares - (before - self._closed) / self._travel)
@@ -142,7 +171,10 @@ class Gripper:
     def touches(self, model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> bool:
         """Return whether every finger touches a geom.
 
-        Needs kinematics to be up to date in `data`.
+        Args:
+            model: The compiled model.
+            data: Its data, with up-to-date kinematics.
+            geom: Id of the geom.
         """
         # For two separate boxes `mj_geomDistance` sometimes returns 0, but only if they are nearer
         # than `TOUCH`.
@@ -156,7 +188,8 @@ class Gripper:
 def sweep(robot: Robot) -> Sweep:
     """Move a robot's gripper from closed to open and measure where the fingers come to rest.
 
-    Raises `UsageError` if they do not come apart.
+    Raises:
+        UsageError: If the fingers touch when open, or do not come apart.
     """
     spec = arm_spec(robot)
     set_time_step(spec)
@@ -237,8 +270,9 @@ def sweep(robot: Robot) -> Sweep:
 
 
 def set_time_step(spec: mujoco.MjSpec) -> None:
-    """Give a gripper that is simulated alone a time step and an integrator that stiff linkages
-    bear.
+    """Set a time step and an integrator that stiff linkages bear.
+
+    They are for a gripper that is simulated alone.
     """
     spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
@@ -269,11 +303,20 @@ def _near(gaps: F64, geoms: Sequence[int], least: float) -> list[int]:
 def finger_geoms(
     model: mujoco.MjModel, fingers: Sequence[str], prefix: str = ""
 ) -> list[tuple[int, ...]]:
-    """Return for each finger the ids of the geoms with contacts on its body and that body's
-    descendants.
+    """Find the geoms with contacts on each finger's body and on that body's descendants.
 
-    A descendant that is another finger is left out. prefix: prefix of the bodies' names. Raises
-    `UsageError` for a finger without such a geom.
+    A descendant that is another finger is left out.
+
+    Args:
+        model: A compiled model.
+        fingers: Names of the fingers' bodies, without the prefix.
+        prefix: Prefix of the bodies' names in the model.
+
+    Returns:
+        For each finger, the ids of its geoms, rising.
+
+    Raises:
+        UsageError: If a finger has no such geom.
     """
     owners = {model.body(prefix + name).id: place for place, name in enumerate(fingers)}
     for body in range(1, model.nbody):

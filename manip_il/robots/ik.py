@@ -25,11 +25,10 @@ _LARGEST = 0.5  # largest step of a joint in `moved` [rad]
 
 
 class PoseProgram:
-    """mink's quadratic program that moves a site to a pose and the joints towards `home`, within
-    their limits.
+    """mink's quadratic program that moves a site to a pose, within the joints' limits.
 
-    With the twist e (6,) from the target to the site, its Jacobian J (6, n) and the costs W of its
-    entries, the joint displacement dq (n,) minimises
+    It also moves the joints towards `home`. With the twist e (6,) from the target to the site, its
+    Jacobian J (6, n) and the costs W of its entries, the joint displacement dq (n,) minimises
 
         |W (J dq + e)|^2 + c^2 |q + dq - home|^2 + (d + m |W e|^2) |dq|^2
 
@@ -73,8 +72,11 @@ class PoseProgram:
         mujoco.mj_comPos(self.model, self.data)
 
     def solve(self, position: F64, rotation: F64) -> F64 | None:
-        """Return a joint displacement (n,) [rad] towards a pose, (3,) [m] and (3, 3), or None if
-        none is found.
+        """Return a joint displacement towards a pose, (n,) [rad]; None if none is found.
+
+        Args:
+            position: Target of the site in the world, (3,) [m].
+            rotation: Its target rotation, (3, 3).
         """
         mujoco.mju_mat2Quat(self._target.wxyz_xyz[:4], rotation.ravel())
         self._target.wxyz_xyz[4:] = position
@@ -91,8 +93,9 @@ class PoseProgram:
 
 
 class ArmIK:
-    """Inverse kinematics of an arm: a step depends only on the posture last given to `ee_pose`
-    and on `home`.
+    """Inverse kinematics of an arm.
+
+    A step depends only on the posture last given to `ee_pose` and on `home`.
     """
 
     def __init__(self, robot: Robot):
@@ -126,22 +129,28 @@ class ArmIK:
         return yaw_ahead(self._robot, self._data.xanchor[self._shoulder], position)
 
     def smallest_singular_value(self, q: F64) -> float:
-        """Return the Jacobian's smallest singular value in a posture (arm,) [rad]: 0 if it is
-        singular.
+        """Return the Jacobian's smallest singular value: 0 in a singular posture.
+
+        Args:
+            q: The posture, (arm,) [rad].
         """
         self.ee_pose(q)
         return float(np.linalg.svd(self._site_jacobian(), compute_uv=False)[-1])
 
     def lowest_link(self, q: F64) -> float:
-        """Return the height [m] of the lowest link beyond the shoulder in a posture (arm,)
-        [rad].
+        """Return the height of the lowest link beyond the shoulder [m].
+
+        Args:
+            q: The posture, (arm,) [rad].
         """
         self.ee_pose(q)
         return float(self._data.xpos[self._links, 2].min()) if self._links else 0.0
 
     def ee_pose(self, q: F64) -> tuple[F64, F64]:
-        """Return position (3,) [m] and rotation matrix (3, 3) of `ee` in the world at `q` (arm,)
-        [rad].
+        """Return the position (3,) [m] and the rotation matrix (3, 3) of `ee` in the world.
+
+        Args:
+            q: The posture, (arm,) [rad], from which the next `step` starts.
         """
         self._qpos[self._address] = q
         self._program.update()
@@ -150,8 +159,19 @@ class ArmIK:
     def displacement(
         self, position: F64, rotation: F64, largest: float, weight: float | None = None
     ) -> F64 | None:
-        """Return only the displacement of `step`, (arm,) [rad]. weight: rotation cost, else
-        `Costs.orientation`.
+        """Return the joint displacement of one `step` alone, without the error that remains.
+
+        It starts from the posture of the last `ee_pose` call.
+
+        Args:
+            position: Target of `ee` in the world, (3,) [m].
+            rotation: Its target rotation, (3, 3).
+            largest: Longest step of a joint [rad].
+            weight: Cost per radian of rotation error; by default `Costs.orientation`.
+
+        Returns:
+            The displacement, (arm,) [rad], scaled down as a whole if one joint exceeds `largest`;
+            None if the program has no solution.
         """
         self._program.frame.cost[3:] = self._costs.orientation if weight is None else weight
         x = self._program.solve(position, rotation)
@@ -164,8 +184,9 @@ class ArmIK:
     def step(
         self, position: F64, rotation: F64, largest: float, lean: float = 0.0
     ) -> tuple[F64, float] | None:
-        """Return one step towards a pose of `ee`, from the posture of the `ee_pose` call that must
-        precede each step.
+        """Return one step towards a pose of `ee`.
+
+        It starts from the posture of the `ee_pose` call that must precede each step.
 
         Args:
             position: Target of `ee` in the world, (3,) [m].
@@ -191,18 +212,18 @@ class ArmIK:
         return dq, self._pose_error(position, rotation, weight) / before
 
     def moved(self, q: F64, motions: F64) -> F64:
-        """Return joints (B, arm) [rad], within their limits and near `q` (B, arm), that move `ee`
-        by `motions`.
+        """Return joints that move `ee` by given motions, (B, arm) [rad].
+
+        They are within their limits and near `q`. A pose out of reach is only approached.
 
         The first step is `displacement`, which resolves redundancy (the elbow of an arm with seven
         joints) as for the expert. The corrections after it are damped least-squares steps, dq = J^T
         (J J^T + 1e-8 I)^-1 e (Nakamura and Hanafusa 1986, J. Dyn. Sys. Meas. Control 108, 163-171).
-        A pose out of reach is only approached.
 
         Args:
             q: Measured joints, (B, arm) [rad].
-            motions: Translations [m] and rotation vectors [rad] of `ee` in the world's axes, (B,
-                6).
+            motions: Translations [m] and rotation vectors [rad] of `ee` in the world's axes,
+                (B, 6).
         """
         return np.array([self._moved(*row) for row in zip(q, motions, strict=True)]).reshape(
             q.shape

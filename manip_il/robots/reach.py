@@ -57,8 +57,11 @@ _BLOCKED = 0.1  # error added for a posture in which the robot collides with its
 class Reach:
     """A grid of points and an error for each: how far from the point the downward hand ends up.
 
-    Eight neighbouring points are the corners of a cell. origin: the grid's first point, (3,) [m].
-    errors: [m], an array with the axes x, y and z.
+    Eight neighbouring points are the corners of a cell.
+
+    Attributes:
+        origin: The grid's first point, (3,) [m].
+        errors: Error at each point, an array with the axes x, y and z [m].
     """
 
     origin: F64
@@ -81,8 +84,10 @@ class Reach:
         return self.origin.tolist()
 
     def error(self, position: Sequence[float] | F64) -> float:
-        """Return how far from `position` (3,) [m] the hand ends up [m], plus how far `position`
-        is outside the map.
+        """Return how far from a position the hand ends up [m].
+
+        Args:
+            position: The position, (3,) [m]; how far it is outside the map is added.
         """
         place = (np.asarray(position) - self.origin) / _CELL
         last = np.array(self.errors.shape) - 1
@@ -97,8 +102,10 @@ class Reach:
         )
 
     def has(self, position: Sequence[float] | F64) -> bool:
-        """Return whether the hand reaches all corners of the map's cell that contains `position`
-        (3,) [m].
+        """Return whether the hand reaches all corners of the map's cell that contains a position.
+
+        Args:
+            position: The position, (3,) [m].
         """
         cells = self._arrives
         x, y, z = position
@@ -116,14 +123,18 @@ class Reach:
         return inside & self.arrives[tuple(index.clip(0, last).T)]
 
     def nearly(self, position: Sequence[float] | F64) -> bool:
-        """Return whether the hand gets near `position` [m], (3,): close enough for a label to
-        make sense.
+        """Return whether the hand gets near enough to a position for a label to make sense.
+
+        Args:
+            position: The position, (3,) [m].
         """
         return self.has(position) or self.error(position) < STRETCH
 
     def lean(self, position: Sequence[float] | F64) -> float:
-        """Return how much the hand must lean to reach `position` [m], (3,), from 0 (pointing
-        down) to 1.
+        """Return how much the hand must lean to reach a position, from 0 (pointing down) to 1.
+
+        Args:
+            position: The position, (3,) [m].
         """
         if self.has(position):
             return 0.0
@@ -147,8 +158,9 @@ class Reach:
 
 @cache
 def reach_of(robot: Robot) -> Reach:
-    """Return a robot's map: read from its file, else computed (some seconds) and stored if
-    possible.
+    """Return a robot's map, from its file if there is one.
+
+    Otherwise it is computed, which takes some seconds, and stored if possible.
     """
     path = _place(robot)
     # other files raise many kinds of errors

@@ -29,9 +29,13 @@ WRIST_CAMERA = (0.10, 0.0, -0.08)
 class EndEffector:
     """Frame `ee`: between the fingertips, z out of the hand, y along the fingers' motion.
 
-    With the hand straight down at zero yaw, its axes are the world's x, -y, -z. position [m],
-    quaternion (wxyz): its pose in `body`. lowest: least height of the frame over the table, at
-    which the fingertips just clear it [m].
+    With the hand straight down at zero yaw, its axes are the world's x, -y, -z.
+
+    Attributes:
+        body: Name of the body that carries the frame.
+        position: Position of the frame in `body`, (3,) [m].
+        quaternion: Rotation of the frame in `body`, wxyz.
+        lowest: Least height of the frame over the table, at which the fingertips just clear it [m].
     """
 
     body: str
@@ -42,13 +46,19 @@ class EndEffector:
 
 @dataclass(frozen=True)
 class GripperConfig:
-    """The driven joints, their positions when the gripper is closed and open, and the bodies that
-    touch objects.
+    """A gripper's joints, their positions when it is closed and open, and its fingers.
 
-    closed, open: [m] if a joint slides, [rad] if it turns. finger_mass: replaces every finger's
-    mass [kg]. force: limit of a driven joint, by default 40 N if it slides and 10 N m if it turns.
-    files: the gripper's own model, if any; its names then begin with `gripper/`. position [m],
-    quaternion (wxyz): the gripper's pose in the hand's body.
+    Attributes:
+        joints: Names of the driven joints.
+        closed: Their positions when the gripper is closed, [m] if a joint slides, [rad] if it
+            turns.
+        open: Their positions when the gripper is open, in the same units.
+        fingers: Names of the bodies that touch objects, two or more.
+        finger_mass: Mass that replaces every finger's own [kg].
+        force: Limit of a driven joint; by default 40 N if it slides and 10 N m if it turns.
+        files: The gripper's own model, if any; its names then begin with `gripper/`.
+        position: Position of the gripper in the hand's body, (3,) [m].
+        quaternion: Rotation of the gripper in the hand's body, wxyz.
     """
 
     joints: tuple[str, ...]
@@ -69,8 +79,12 @@ class GripperConfig:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Volume in which tasks take place: within half_width of the centre along x and y, `height`
-    above the table [m].
+    """Volume in which tasks take place.
+
+    Attributes:
+        centre: Its centre on the table, x and y [m].
+        half_width: How far it extends from the centre along x and y [m].
+        height: How far it extends above the table [m].
     """
 
     centre: tuple[float, float]
@@ -94,11 +108,14 @@ class TableTop:
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Position of a camera and its target in the world, (3,) [m], and its vertical field of view
-    [deg].
+    """Pose of a camera in the world: z = 0 is the table's top, x points away from the robot.
 
-    z = 0 is the table's top, x points away from the robot. If the camera looks straight down, x is
-    up in its picture.
+    If the camera looks straight down, x is up in its picture.
+
+    Attributes:
+        position: Position of the camera, (3,) [m].
+        target: Point that it looks at, (3,) [m].
+        fovy: Vertical field of view [deg].
     """
 
     position: tuple[float, float, float]
@@ -127,8 +144,10 @@ class CameraPose:
 class Costs:
     """Costs of inverse kinematics, relative to 1 per metre of position error.
 
-    orientation: per radian of rotation error; leaning: the same for a hand that leans to reach
-    farther; posture: per radian of a joint's distance from home.
+    Attributes:
+        orientation: Cost per radian of rotation error.
+        leaning: The same for a hand that leans to reach farther.
+        posture: Cost per radian of a joint's distance from home.
     """
 
     orientation: float = 0.2
@@ -140,9 +159,11 @@ class Costs:
 class LeRobotConfig:
     """A robot as LeRobot's recorder knows it.
 
-    robot_type: as in `meta/info.json`. names: servo names, the arm's from base to hand, then the
-    gripper's. gripper: positions of the gripper's driven joint at 0 and at 100 [rad]. fps: frames
-    per second.
+    Attributes:
+        robot_type: Type of the robot, as in `meta/info.json`.
+        names: Names of the servos, the arm's from base to hand, then the gripper's.
+        gripper: Positions of the gripper's driven joint at 0 and at 100 [rad].
+        fps: Frames per second.
     """
 
     robot_type: str
@@ -159,8 +180,10 @@ class LeRobotConfig:
             )
 
     def percent(self, joint: F64) -> F64:
-        """Return the gripper's positions, 0 to 100, for positions `joint` of its driven joint
-        [rad].
+        """Return the gripper's positions, 0 to 100.
+
+        Args:
+            joint: Positions of the gripper's driven joint [rad].
         """
         at_0, at_100 = self.gripper
         return 100 * (joint - at_0) / (at_100 - at_0)
@@ -175,17 +198,32 @@ SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)
 class Robot:
     """A joint-position-controlled arm with a gripper.
 
-    hand: body that carries the gripper. joints: the arm's, base to hand. home: a posture over the
-    workspace with the hand down [rad]. gains, forces, armature: each joint's kp [N m/rad], greatest
-    torque [N m] and added inertia [kg m^2]. base: position of the root body [m]. fixed: positions
-    of the joints that are neither the arm's nor the gripper's [rad or m]. max_joint_step: largest
-    step of a joint target from the measured position [rad]. costs: of inverse kinematics. yaw:
-    where zero yaw points: along the world's x (world) or away from the shoulder (shoulder).
-    wrist_camera: name of the model's camera on its hand, or position of an added one in the frame
-    `ee` [m]. cameras: poses of the scene's cameras, front and side, that replace the default ones.
-    table: the scene's table. colours: red, green and blue of meshes without contacts, by patterns
-    of their names; later patterns win. lerobot: how LeRobot's recorder writes the robot; its
-    servos' units then replace [rad] and [m].
+    Attributes:
+        name: The robot's name.
+        files: Its MuJoCo model.
+        hand: Name of the body that carries the gripper.
+        joints: Names of the arm's joints, base to hand.
+        home: A posture over the workspace with the hand down, (arm,) [rad].
+        gains: Each joint's kp [N m/rad].
+        forces: Each joint's greatest torque [N m].
+        armature: Each joint's added inertia [kg m^2].
+        ee: The frame between the fingertips.
+        gripper: The gripper.
+        workspace: Volume in which tasks take place.
+        costs: Costs of inverse kinematics.
+        yaw: Where zero yaw points: along the world's x (`world`) or away from the shoulder
+            (`shoulder`).
+        wrist_camera: Name of the model's camera on its hand, or position of an added one in the
+            frame `ee` [m].
+        cameras: Poses of the scene's cameras, front and side, that replace the default ones.
+        table: The scene's table.
+        base: Position of the root body, (3,) [m]; None: as in the model.
+        fixed: Positions of the joints that are neither the arm's nor the gripper's [rad or m].
+        max_joint_step: Largest step of a joint target from the measured position [rad].
+        colours: Red, green and blue of meshes without contacts, by patterns of their names; later
+            patterns win.
+        lerobot: How LeRobot's recorder writes the robot; its servos' units then replace [rad]
+            and [m].
     """
 
     name: str
@@ -223,9 +261,7 @@ class Robot:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the entries of `observation.state` and `action`: arm joints, then the
-        gripper.
-        """
+        """Names of the entries of an action or a state: arm joints, then the gripper."""
         return self.lerobot.names if self.lerobot is not None else (*self.joints, "gripper")
 
     @property
@@ -235,14 +271,10 @@ class Robot:
 
     @property
     def faces_ahead(self) -> bool:
-        """Whether yaw 0 of the hand points away from the shoulder, rather than along the world's
-        x.
-        """
+        """Whether yaw 0 of the hand points away from the shoulder, not along the world's x."""
         return self.yaw != "world"
 
     @property
     def leans(self) -> bool:
-        """Whether the hand leans everywhere, as the arm has too few joints to point it straight
-        down.
-        """
+        """Whether the hand leans everywhere, as too few joints cannot point it straight down."""
         return self.costs.orientation == self.costs.leaning

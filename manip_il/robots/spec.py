@@ -35,7 +35,12 @@ _SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 def load(files: ModelFiles, robot: str) -> mujoco.MjSpec:
     """Read a model, without compiler options that would affect the whole scene.
 
-    robot: its name. Raises `UsageError` if MuJoCo cannot read the model.
+    Args:
+        files: The model's files.
+        robot: The robot's name, for messages.
+
+    Raises:
+        UsageError: If MuJoCo cannot read the model.
     """
     spec = files.load(robot)
     _turn_inertias(spec)
@@ -74,8 +79,16 @@ def bare_spec(
 
     A gripper with its own model is attached to the hand.
 
-    robot: its name. camera: name of the camera on the hand, kept as `wrist`. Raises `UsageError`
-    naming the file that MuJoCo cannot read, or the body or camera that is missing.
+    Args:
+        robot: The robot's name, for messages.
+        files: The arm's model.
+        hand: Name of the body that carries the gripper.
+        gripper: The gripper, of which only its own model and its pose in the hand's body are used.
+        camera: Name of the model's camera on the hand, kept as `wrist`; empty if there is none.
+
+    Raises:
+        UsageError: If MuJoCo cannot read a file.
+        UnknownName: If the model does not have the hand's body or the camera.
     """
     spec = load(files, robot)
     require(robot, "body", (hand,), spec.bodies)
@@ -96,7 +109,18 @@ def bare_spec(
 def arm_joints(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig) -> tuple[str, ...]:
     """Return the names of the hinges between the base and the hand, except the gripper's.
 
-    robot: its name. Raises `UsageError` if there are none, or as `bare_spec` does.
+    Args:
+        robot: The robot's name, for messages.
+        files: The arm's model.
+        hand: Name of the body that carries the gripper.
+        gripper: The gripper, whose joints are left out.
+
+    Returns:
+        The names, from base to hand.
+
+    Raises:
+        UsageError: If there is no such hinge, or MuJoCo cannot read a file.
+        UnknownName: If the model does not have the hand's body.
     """
     spec = bare_spec(robot, files, hand, gripper)
     joints, body = list[str](), spec.body(hand)
@@ -112,10 +136,12 @@ def arm_joints(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig)
 
 
 def arm_spec(robot: Robot) -> mujoco.MjSpec:
-    """Return the arm and gripper as a spec: position-controlled, with the site `ee`, and nothing
-    else.
+    """Return the arm and gripper as a spec.
 
-    Raises `UsageError` naming the joint, body or file that is missing, and those that exist.
+    It is position-controlled, with the site `ee`, and has nothing else.
+
+    Raises:
+        UsageError: If a joint, body or file is missing; the message names it, and those that exist.
     """
     camera = robot.wrist_camera if isinstance(robot.wrist_camera, str) else ""
     spec = bare_spec(robot.name, robot.files, robot.hand, robot.gripper, camera)
@@ -143,10 +169,14 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
 
 
 def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, place: Sequence[float]) -> None:
-    """Add the camera `wrist` to an arm, at a place (3,) [m] in the frame `ee`, tilted towards the
-    fingertips.
+    """Add the camera `wrist` to an arm, tilted towards the fingertips.
 
-    model: the compiled arm. The camera looks along its -z, and its x is parallel to the hand's y.
+    The camera looks along its -z, and its x is parallel to the hand's y.
+
+    Args:
+        spec: The arm, with the site `ee`; the camera is added to the body of this site.
+        model: The same arm, compiled.
+        place: Position of the camera in the frame `ee`, (3,) [m].
     """
     rotation = np.zeros(9)
     quat = np.zeros(4)
@@ -187,8 +217,16 @@ def model_bytes(model: mujoco.MjModel) -> bytes:
 
 
 def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -> None:
-    """Raise `UnknownName` for a name that no element in `there` has. kind: what the elements
-    are, such as joint.
+    """Check that a robot's model has all elements that its YAML names.
+
+    Args:
+        robot: The robot's name, for messages.
+        kind: What the elements are, such as joint.
+        names: Names in the YAML.
+        there: Elements of the model.
+
+    Raises:
+        UnknownName: If no element has one of the names.
     """
     known = [one.name for one in there if one.name and one.name != "world"]
     for name in names:
@@ -197,8 +235,13 @@ def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -
 
 
 def linkage(spec: mujoco.MjSpec, robot: Robot) -> list[str]:
-    """Return the names of the joints beyond the hand that nothing drives or fixes: those of the
-    gripper's linkage.
+    """Return the names of the joints of the gripper's linkage.
+
+    These are the joints beyond the hand that nothing drives or fixes.
+
+    Args:
+        spec: The robot's model.
+        robot: The robot.
     """
     apart = {*robot.joints, *robot.gripper.joints, *robot.fixed}
     below = spec.body(robot.hand).find_all("joint")
@@ -303,8 +346,13 @@ def _remove_scene_elements(spec: mujoco.MjSpec, hand: str = "", kept: str = "") 
 
 
 def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
-    """Copy physics options from one spec to another: MuJoCo warns if two specs that it joins
-    have different ones.
+    """Copy physics options from one spec to another.
+
+    MuJoCo warns if two specs that it joins have different ones.
+
+    Args:
+        origin: The spec to copy from.
+        spec: The spec to change.
     """
     for name in dir(origin.option):
         if not name.startswith("_"):

@@ -43,12 +43,17 @@ workspace:
 
 
 def suggest(model: Path, gripper: Path | None = None) -> dict[str, Any]:
-    """Inspect a robot's MJCF, and its gripper's if there is one.
+    """Draft the content of a YAML, without paths, from a robot's MJCF.
 
-    Return the content of a YAML, without paths.
+    Args:
+        model: Path of the robot's MJCF.
+        gripper: Path of the gripper's MJCF, if it has one of its own.
 
-    Raises `UsageError` if MuJoCo cannot read or compile them, or if no hand or no fingers are
-    found.
+    Returns:
+        The keys `hand`, `gripper` and `workspace` with their values.
+
+    Raises:
+        UsageError: If MuJoCo cannot read or compile a file, or if no hand or no fingers are found.
     """
     last = gripper or model
     spec, with_jaws = (load(ModelFiles(path.absolute()), model.stem) for path in (model, last))
@@ -201,8 +206,13 @@ def _to_centimetres(length: float) -> float:
 
 
 def yaml_of(found: Mapping[str, Any], model: str, gripper: str = "") -> str:
-    """Return what `suggest` found as YAML text, with comments. model, gripper: their paths, as
-    written to the YAML.
+    """Return what `suggest` found as YAML text, with comments.
+
+    Args:
+        found: The result of `suggest`.
+        model: Path of the robot's MJCF, as written to the YAML.
+        gripper: Path of the gripper's MJCF, as written to the YAML; empty if it has none of its
+            own.
     """
     values = {"model": model, "hand": found["hand"], **found["gripper"], **found["workspace"]}
     # JSON is YAML

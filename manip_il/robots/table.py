@@ -23,10 +23,14 @@ GROUP = "manip_il.robots"  # entry points: a robot's name, and the path of its Y
 
 
 def get_robot(name: NameOrPath) -> Robot:
-    """Return a robot by its name or its entry point, or from the YAML at a `Path` that the user
-    gave.
+    """Return a robot.
 
-    Raises `UnknownName`, `UsageError`.
+    Args:
+        name: Its name, its entry point, or the `Path` of a YAML that the user gave.
+
+    Raises:
+        UnknownName: If there is no robot of this name.
+        UsageError: If its YAML is invalid.
     """
     if isinstance(name, Path):
         return _read(name.absolute())
@@ -50,7 +54,14 @@ def is_robot(name: str) -> bool:
 
 
 def read_robot(path: Path) -> Robot:
-    """Read a robot's YAML. Raises `UsageError` naming the file and what is wrong in it."""
+    """Read a robot's YAML.
+
+    Args:
+        path: Path of the YAML.
+
+    Raises:
+        UsageError: If something in it is wrong; the message names the file and what is wrong.
+    """
     try:
         if path.stem in ROBOTS and path.resolve() != ROBOTS[path.stem].resolve():
             raise ManipError(f"a built-in robot is called {path.stem}; rename the file")

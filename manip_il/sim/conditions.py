@@ -114,26 +114,41 @@ _KNOCK_STEP = (5, 24)  # default for a condition with a knock
 
 @dataclass(frozen=True, init=False)
 class Condition:
-    """Ranges (low, high), both ends included, or single numbers, for the quantities below.
+    """Ranges of the quantities that differ from the nominal world; all others are nominal.
 
-    All others are nominal.
+    Each range is (low, high), both ends included, or a single number.
 
-    action_noise: standard deviation of Gaussian noise on every executed action, as a share of its
-    full range. random_actions: share of control steps at which a random action is executed, each
-    joint within its longest step. knock: distance by which the object is moved once [m], at a
-    control step from knock_step, by default 5 to 24. joint_noise [rad], position_noise [m]:
-    standard deviations of Gaussian noise on the joints and the object's position in a policy's
-    observations. delay: control steps by which observations are late. mass [kg], size (edge or
-    width [m]) and sliding friction of the object. colour: red, green and blue of the object, each
-    from the range; table: the same for the table. joint_damping: factor on the damping of every arm
-    joint; actuator_gain: factor on kp of the arm's actuators, and its square root on kv. posture:
-    largest offset of every joint from home at the start [rad]. camera_shift [m], camera_turn [deg]:
-    shift and rotation of every camera, in a random direction. brightness: factor on every lamp;
-    light_turn: rotation of the lamps about the vertical [deg]. clutter: number of visual objects
-    around the workspace. picture_delay: control steps by which only pictures are late.
+    Args:
+        name: The condition's name, which must be usable as a file name.
+        action_noise: Standard deviation of Gaussian noise on every executed action, as a share of
+            its full range.
+        random_actions: Share of control steps at which a random action is executed, each joint
+            within its longest step.
+        knock: Distance by which the object is moved once [m].
+        knock_step: Control step at which it is moved, by default 5 to 24.
+        joint_noise: Standard deviation of Gaussian noise on the joints in a policy's
+            observations [rad].
+        position_noise: The same for the object's position [m].
+        delay: Control steps by which observations are late.
+        mass: Mass of the object [kg].
+        size: Edge or width of the object [m].
+        friction: Sliding friction of the object.
+        joint_damping: Factor on the damping of every arm joint.
+        actuator_gain: Factor on kp of the arm's actuators; its square root is that on kv.
+        posture: Largest offset of every joint from home at the start [rad].
+        colour: Red, green and blue of the object, each from the range.
+        table: The same for the table.
+        camera_shift: Shift of every camera, in a random direction [m].
+        camera_turn: Rotation of every camera, about a random axis [deg].
+        brightness: Factor on every lamp.
+        light_turn: Rotation of the lamps about the vertical [deg].
+        clutter: Number of visual objects around the workspace.
+        picture_delay: Control steps by which only pictures are late.
 
-    Raises `UnknownName` for an unknown range, `UsageError` for a range that is empty or out of
-    bounds, `ManipError` for a name that cannot be a file name.
+    Raises:
+        UnknownName: If there is no quantity of a range's name.
+        UsageError: If a range is empty or out of bounds.
+        ManipError: If the name cannot be a file name.
     """
 
     name: str
@@ -154,11 +169,16 @@ class Condition:
     def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
         """Return the condition without the ranges that have no effect.
 
-        None if it had some and none is left.
+        Args:
+            has_object: Whether the task has an object.
+            sees: Whether the policy has cameras.
+            sizes: Object sizes that the task can take [m]; None: only its own.
 
-        has_object: whether the task has an object. sees: whether the policy has cameras. sizes:
-        object sizes that the task can take [m]; None: only its own. Raises `UsageError` if none of
-        the condition's sizes is among them.
+        Returns:
+            The condition; None if it had ranges and none of them is left.
+
+        Raises:
+            UsageError: If the task can take none of the condition's sizes.
         """
         kept = {
             name: range_
@@ -174,8 +194,10 @@ class Condition:
         return Condition(self.name, **kept)
 
     def only(self, changes: str) -> Condition:
-        """Return the condition with only the ranges that change one thing, see
-        `Quantity.changes`.
+        """Return the condition with only the ranges that change one thing.
+
+        Args:
+            changes: What they change, as in `Quantity.changes`.
         """
         kept = {
             name: range_ for name, range_ in self.ranges.items() if RANGES[name].changes == changes
@@ -183,12 +205,14 @@ class Condition:
         return Condition(self.name, **kept)
 
     def draw(self, seed: int) -> dict[str, Any]:
-        """Return the values drawn for the episode of a seed, by the names of the ranges and in
-        their units.
+        """Return the values drawn for an episode, by the names of the ranges and in their units.
 
         Each value has a random stream of its own, so that adding a range leaves the other values
         unchanged. camera_shift and camera_turn have one vector (3,) per camera, in the camera's own
         frame.
+
+        Args:
+            seed: Seed of the episode.
         """
         return {
             name: RANGES[name].draw(rng_for(seed, f"condition {name}"), range_)
@@ -224,10 +248,12 @@ def turn_of(conditions: Sequence[Condition], seed: int) -> Condition:
 
 
 def draw(conditions: Sequence[Condition], seed: int, shape: NameOrPath = "") -> dict[str, Any]:
-    """Return the values drawn for the episode of a seed, by name, from the condition that `turn_of`
-    returns.
+    """Return the values drawn for the episode of a seed, by name.
 
-    shape: as in `EnvConfig.object`; if it is `any`, one of `KINDS` is drawn, too.
+    Args:
+        conditions: Conditions that take turns by seed, as in `turn_of`.
+        seed: Seed of the episode.
+        shape: The object, as in `EnvConfig.object`; if it is `any`, one of `KINDS` is drawn, too.
     """
     drawn = turn_of(conditions, seed).draw(seed)
     if not draws_shape(shape):

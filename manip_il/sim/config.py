@@ -45,8 +45,9 @@ class Episodes:
 
     @property
     def physics_step(self) -> float:
-        """Physics time step: `DT_SIM`, or a little less if that does not divide a control step
-        [s].
+        """Physics time step [s].
+
+        It is `DT_SIM`, or a little less if that does not divide a control step.
         """
         return 1 / (self.control_hz * self.physics_steps)
 
@@ -58,12 +59,19 @@ _BRIGHTNESS = (0.1, 2.0)
 
 @dataclass(frozen=True)
 class Look:
-    """Lighting of a scene: part of a dataset's fingerprint, and adjustable when pictures are
-    rendered again.
+    """Lighting of a scene, which can be changed when pictures are rendered again.
 
-    shadows: draw the main lamp's shadows; a picture then takes two to six times as long.
-    brightness: factor on every lamp. light_turn: rotation of the lamps about the vertical through
-    the world's origin, -180 to 180 [deg]. Raises `UsageError` for a value out of range.
+    It is part of a dataset's fingerprint.
+
+    Attributes:
+        shadows: Whether to draw the main lamp's shadows; a picture then takes two to six times as
+            long.
+        brightness: Factor on every lamp.
+        light_turn: Rotation of the lamps about the vertical through the world's origin, -180 to
+            180 [deg].
+
+    Raises:
+        UsageError: If a value is out of range.
     """
 
     shadows: bool = option(False, "draw shadows; rendering then takes two to six times as long")
@@ -85,11 +93,17 @@ FILM = Look(shadows=True)  # for people: shadows show how high things are
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """Cameras that take a picture at every step, and the height, width [pixels] and look of their
-    pictures.
+    """Cameras that take a picture at every step.
 
-    Raises `UsageError` if no camera is named or one is named twice, or if a height
-    or width is odd (which 4:2:0 video does not allow) or out of range.
+    Attributes:
+        names: Names of the cameras.
+        height: Height of their pictures [pixels].
+        width: Width of their pictures [pixels].
+        look: Lighting of their pictures.
+
+    Raises:
+        UsageError: If no camera is named or one is named twice, or if a height or width is odd
+            (which 4:2:0 video does not allow) or out of range.
     """
 
     names: tuple[str, ...]

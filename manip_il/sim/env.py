@@ -35,17 +35,23 @@ _JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
 class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     """Joint-position control of one arm on one task. `manip_il.make_env` makes it from names.
 
-    Action: joint position targets and gripper command in the units of `ActionSpace`, (n,), float32.
-    Observation: a dict of `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels`
-    {camera: uint8 (H, W, 3)}. Reward is 1 while the task is solved, else 0. An episode ends only at
-    the horizon (truncated), so that "solved once" and "solved at the end" can both be measured.
-    conditions: how episodes differ from the nominal world; they take turns by seed, and `drawn` has
-    the current episode's values. `get_state` returns the true state, without the noise and delay of
-    observations. Everything after it depends on the state, the actions and the conditions alone,
-    except that observations from before it do not arrive late after `set_state`. render_mode:
-    `rgb_array`, or `human`, with which `reset` and `step` update MuJoCo's viewer in real time.
-    Raises `UnknownName` for an unknown camera or render_mode, `UsageError` if the scene cannot be
-    built, `RenderError` for `human` without a display.
+    The action is float32 (n,): joint position targets and the gripper command, in the units of
+    `ActionSpace`. The observation is a dict of `agent_pos` (n,), `environment_state` (k,) and, with
+    cameras, `pixels` {camera: uint8 (H, W, 3)}. The reward is 1 while the task is solved, else 0.
+    An episode ends only at the horizon (truncated), so that "solved once" and "solved at the end"
+    can both be measured.
+
+    `get_state` returns the true state, without the noise and delay of observations. Everything
+    after it depends on the state, the actions and the conditions alone, except that observations
+    from before it do not arrive late after `set_state`.
+
+    Attributes:
+        world: The scene's physics.
+        config: Length and control rate of the episodes, and when they count as solved.
+        look: Lighting of pictures.
+        cameras: Names of the cameras of observations.
+        drawn: Values that the conditions drew for the current episode, by name.
+        task: Name of the task.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -64,6 +70,23 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         render_mode: str | None = None,
         conditions: Sequence[Condition] = (),
     ):
+        """Build the scene, or take it from the cache.
+
+        Args:
+            robot: The robot.
+            task: The task.
+            config: Length and control rate of the episodes, and when they count as solved.
+            cameras: Cameras of observations; None: no pictures.
+            look: Lighting of `render`'s pictures; by default that of `cameras`.
+            render_mode: `rgb_array`, or `human`, with which `reset` and `step` update MuJoCo's
+                viewer in real time.
+            conditions: How episodes differ from the nominal world; they take turns by seed.
+
+        Raises:
+            UnknownName: If there is no such camera or render mode.
+            UsageError: If the scene cannot be built.
+            RenderError: If `human` is asked for and there is no display.
+        """
         self.look, self._view = look or (cameras.look if cameras else Look()), cameras
         self.config = config
         self.world = World(build_scene(robot, task, config.physics_step))
@@ -91,7 +114,15 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Draw a start. The same seed gives the same start, bit for bit."""
+        """Draw a start. The same seed gives the same start, bit for bit.
+
+        Args:
+            seed: Seed of the episode; None: drawn from the generator of the last seed given.
+            options: Not used.
+
+        Returns:
+            The first observation, and the infos `is_success`, `ever_success` and `distance` [m].
+        """
         super().reset(seed=seed)
         self.start(int(self.np_random.integers(2**62)) if seed is None else seed)
         if self.render_mode == "human":
@@ -151,7 +182,19 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def step(
         self, action: NDArray[Any]
     ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Apply one action (n,) for one control step."""
+        """Apply one action for one control step.
+
+        Args:
+            action: The action, (n,).
+
+        Returns:
+            The observation, the reward, False (no episode ends early), whether the horizon is
+            reached, and the infos as in `reset`.
+
+        Raises:
+            NotFiniteError: If the action has NaN or infinite entries.
+            MismatchError: If it has the wrong shape.
+        """
         self.advance(action)
         if self.render_mode == "human":
             self.render()
@@ -168,11 +211,17 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._begun = True
 
     def advance(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Apply one action (n,) for one control step.
+        """Apply one action for one control step, without making an observation.
 
-        Return it as changed by events, before clipping.
+        Args:
+            action: The action, (n,).
 
-        Raises `NotFiniteError` for NaN or infinity, `MismatchError` for a wrong shape.
+        Returns:
+            The action as changed by events, before clipping, (n,).
+
+        Raises:
+            NotFiniteError: If the action has NaN or infinite entries.
+            MismatchError: If it has the wrong shape.
         """
         self._begin_step()
         scene, data = self.scene, self.data
@@ -184,8 +233,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return executed
 
     def simulate(self) -> None:
-        """Run one control step with the actuators' commands as they are, as `advance` does once
-        it has set them.
+        """Run one control step with the actuators' commands as they are.
+
+        `advance` calls this once it has set them.
         """
         self._begin_step()
         mujoco.mj_step(self.world.model, self.data, self.config.physics_steps)
@@ -197,9 +247,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     @property
     def solved(self) -> bool:
-        """Whether the task is solved: it has been within the tolerance for the required number
-        of steps in a row.
-        """
+        """Whether the task has been within its tolerance for enough steps in a row."""
         return self._streak >= self.config.success_steps
 
     @property
@@ -217,8 +265,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return min(1.0, max(0.0, self._task.progress(self.world)))
 
     def get_state(self) -> State:
-        """Return everything that the world's future depends on, which `set_state` restores bit
-        for bit.
+        """Return everything that the world's future depends on.
+
+        `set_state` restores it bit for bit.
         """
         return State(
             self.world.physics(),
@@ -233,9 +282,11 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def set_state(self, state: State) -> None:
         """Restore a state of the same scene.
 
-        One without a seed goes on with the events of the current episode.
+        Args:
+            state: The state; one without a seed goes on with the events of the current episode.
 
-        Raises `MismatchError` for a state of another scene.
+        Raises:
+            MismatchError: If the state is one of another scene.
         """
         self.world.restore(state.physics, state.variation)
         if state.seed is not None:

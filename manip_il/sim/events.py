@@ -37,15 +37,25 @@ class Kind:
 
 
 def random_action(action: F64, world: World, rng: np.random.Generator) -> F64:
-    """Draw an action (n,): each joint within its longest step from the measured position, any
-    gripper opening.
+    """Draw an action within each joint's longest step from the measured position, (n,).
+
+    The gripper's opening may be any.
+
+    Args:
+        action: Not used.
+        world: The world.
+        rng: Generator to draw from.
     """
     return world.scene.actions.random_near(world.measured, rng)
 
 
 def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
-    """Return `action` (n,) with each joint's step reversed and the gripper command at the
-    opposite end.
+    """Return an action with each joint's step reversed, and the gripper at its other end, (n,).
+
+    Args:
+        action: The action to reverse, (n,).
+        world: The world, whose measured position the steps start from.
+        rng: Not used.
     """
     actions = world.scene.actions
     low, high = actions.low[actions.gripper], actions.high[actions.gripper]
@@ -56,12 +66,16 @@ def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
 def move_object(
     world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0
 ) -> None:
-    """Move the first object of the episode a random distance sideways, to a place within reach,
-    with zero velocity.
+    """Move the first object of the episode a random distance sideways, with zero velocity.
 
-    distance: least and greatest [m]. height: how far up it is moved [m]; above 0 it is also turned
-    at random, and falls. A place where it overlaps something is drawn again; nothing moves if there
-    is no object or no free place.
+    The new place is within reach. A place where the object overlaps something is drawn again;
+    nothing moves if there is no object or no free place.
+
+    Args:
+        world: The world, changed in place.
+        rng: Generator to draw from.
+        distance: Least and greatest distance [m].
+        height: How far up the object is moved [m]; above 0 it is also turned at random, and falls.
     """
     if not world.scene.task.objects:
         return
@@ -88,12 +102,15 @@ def move_object(
 
 
 def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None:
-    """Turn every arm joint and its command at random by up to `largest` [rad].
-
-    An object in the hand stays behind.
+    """Turn every arm joint and its command at random. An object in the hand stays behind.
 
     The arm then touches nothing that it did not touch before, and the hand is where it can point
     down. The arm stays where it is if no such posture is found.
+
+    Args:
+        world: The world, changed in place.
+        rng: Generator to draw from.
+        largest: Largest turn of a joint [rad].
     """
     scene, data = world.scene, world.data
     low, high = (scene.actions.split(end)[0] for end in (scene.actions.low, scene.actions.high))
@@ -114,8 +131,10 @@ def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None
 
 
 def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
-    """Return (geom, geom, False) for each contact of the robot, and (geom, geom, True), too, if
-    the geoms overlap.
+    """Return the contacts of the robot with anything, by their geoms.
+
+    Returns:
+        (geom, geom, False) for each contact and, if the geoms overlap, (geom, geom, True), too.
     """
     model, contact = world.scene.model, world.data.contact
     robot = model.body_rootid[model.site_bodyid[world.scene.ee_site]]
@@ -150,8 +169,10 @@ def kinds_for(task: Task) -> dict[str, Kind]:
 
 
 class Perturbation(Condition):
-    """A condition under which one of `KINDS` happens once. moments: the control step at which it
-    happens, by seed.
+    """A condition under which one of `KINDS` happens once in an episode.
+
+    Attributes:
+        moments: The control step at which it happens, by seed.
     """
 
     moments: Mapping[int, int]
@@ -161,8 +182,10 @@ class Perturbation(Condition):
         vars(self).update(moments=moments)
 
     def draw(self, seed: int) -> dict[str, Any]:
-        """Return the kind's name -> the control step at which it happens in the episode of a
-        seed.
+        """Return the kind's name -> the control step at which it happens.
+
+        Args:
+            seed: Seed of the episode.
         """
         return {self.name: self.moments[seed]}
 
@@ -176,12 +199,16 @@ STANDARD = Condition("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), kn
 
 
 class Events:
-    """Events of one episode: `drawn` says which, how strong and when.
-
-    Directions and noise are drawn from the seed.
-    """
+    """Events of one episode."""
 
     def __init__(self, world: World, drawn: Mapping[str, Any], seed: int):
+        """Take the events that were drawn for an episode.
+
+        Args:
+            world: The world that they change.
+            drawn: Which events happen, how strong and when, as `Condition.draw` returns it.
+            seed: Seed of the episode; directions and noise are drawn from it.
+        """
         self._world = world
         self._drawn = drawn
         self._seed = seed
@@ -209,8 +236,11 @@ class Events:
         return False
 
     def action(self, action: F64, step: int) -> F64:
-        """Return the action (n,) that is executed at a step: `action`, with noise or replaced if
-        an event says so.
+        """Return the action that is executed at a step, (n,).
+
+        Args:
+            action: The action of the policy, (n,); an event may add noise to it, or replace it.
+            step: The control step.
         """
         name, kind = self._kinds.get(step, ("", None))
         if kind is not None and kind.wrong is not None:

@@ -20,11 +20,14 @@ _TEXT = re.compile(r"mesh:(?P<path>.+?\.(?i:stl|obj))(?P<length>:\d*\.?\d+)?", r
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A closed mesh with its centre of mass at the origin: vertices (n, 3) [m], faces (m, 3),
-    volume [m^3].
+    """A closed mesh with its centre of mass at the origin.
 
-    stored: the object's text in datasets, with the file's name and hash in place of its path.
-    sha256: hash of the file.
+    Attributes:
+        stored: The object's text in datasets, with the file's name and hash in place of its path.
+        sha256: Hash of the file.
+        vertices: Positions of the vertices, (n, 3) [m].
+        faces: Indices of the vertices of each triangle, (m, 3).
+        volume: Volume [m^3].
     """
 
     stored: str
@@ -41,9 +44,15 @@ class Mesh:
 
 
 def parse_mesh(shape: Path) -> Mesh:
-    """Return the mesh of `mesh:PATH` or `mesh:PATH:LENGTH`, read once per process.
+    """Return the mesh that a text names, read once per process.
 
-    LENGTH: its longest side [m]; if omitted, the file is in metres. Raises `UsageError`.
+    Args:
+        shape: `mesh:PATH` or `mesh:PATH:LENGTH`, with the length of its longest side [m]; if that
+            is omitted, the file is in metres.
+
+    Raises:
+        UsageError: If the text does not have this form, or the file cannot be read as a closed
+            mesh.
     """
     text = str(shape)
     if (found := _TEXT.fullmatch(text)) is None:

@@ -33,8 +33,14 @@ _DRAWS = 50  # draws of a clutter object's place before it is left out
 
 
 class Prop(NamedTuple):
-    """An object to draw: MuJoCo's geom type and size (3,), position (3,) [m], rotation (3, 3)
-    and colour (RGBA).
+    """An object to draw.
+
+    Attributes:
+        kind: MuJoCo's geom type.
+        size: MuJoCo's size of such a geom, (3,) [m].
+        position: Its position in the world, (3,) [m].
+        rotation: Its rotation, (3, 3).
+        colour: Red, green, blue and opacity.
     """
 
     kind: int
@@ -56,9 +62,10 @@ class Prop(NamedTuple):
 def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] | F64 = (0, 0)) -> list[Prop]:
     """Return the visual objects of a scene's world.
 
-    Poses of mocap bodies and joints in `data` must be up to date.
-
-    clutter: (2,) largest number of objects, and the seed of their kinds and places.
+    Args:
+        scene: The scene.
+        data: Its data, with up-to-date poses of mocap bodies and joints.
+        clutter: Largest number of clutter objects, and the seed of their kinds and places, (2,).
     """
     return [*_stand(scene, data), *_clutter(scene, data, int(clutter[0]), int(clutter[1]))]
 

@@ -38,12 +38,21 @@ _AXES = 0.06, 0.006  # length and thickness of the axes drawn at `ee` [m]
 def pictures(
     scene: Scene, data: mujoco.MjData, cameras: CameraConfig, variation: F64 | None = None
 ) -> dict[str, Picture]:
-    """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width,
-    3).
+    """Return what every camera sees of the physics.
 
-    variation: the world's (v,), by default the scene's own. A picture's bytes depend only on the
-    variation, `qpos` and mocap poses, not on earlier pictures. Raises `RenderError`, which says
-    what to unset or install, if there is no off-screen OpenGL.
+    A picture's bytes depend only on the variation, `qpos` and mocap poses, not on earlier pictures.
+
+    Args:
+        scene: The scene.
+        data: Its data.
+        cameras: The cameras, and the size and look of their pictures.
+        variation: The world's variation, (v,); by default the scene's own.
+
+    Returns:
+        Camera name -> RGB picture, uint8 (height, width, 3).
+
+    Raises:
+        RenderError: If there is no off-screen OpenGL; it says what to unset or install.
     """
     renderer = _renderer(scene, cameras.look)
     renderer.pose(data, scene.nominal if variation is None else variation)
@@ -51,12 +60,19 @@ def pictures(
 
 
 def projections(scene: Scene, cameras: CameraConfig, points: F64) -> dict[str, F32]:
-    """Return where points (K, 3) of the world [m] are in this thread's last `pictures`: name -> (K,
-    3).
+    """Return where points of the world are in this thread's last `pictures`.
 
-    Columns: position across and down, each from 0 to 1, then 1. All three are 0 for a point outside
-    the picture. A point inside may be hidden behind others. Raises `RenderError` as `pictures`
-    does.
+    Args:
+        scene: The scene of these pictures.
+        cameras: The cameras of these pictures.
+        points: Points of the world, (K, 3) [m].
+
+    Returns:
+        Camera name -> (K, 3): position across and down, each from 0 to 1, then 1. All three are 0
+        for a point outside the picture. A point inside may be hidden behind others.
+
+    Raises:
+        RenderError: If there is no off-screen OpenGL.
     """
     renderer = _renderer(scene, cameras.look)
     return {
@@ -68,10 +84,22 @@ def projections(scene: Scene, cameras: CameraConfig, points: F64) -> dict[str, F
 def framed_picture(
     scene: Scene, data: mujoco.MjData, camera: str, size: tuple[int, int], look: Look
 ) -> Picture:
-    """Return what a camera sees of the physics in `data`, with the axes of `ee` drawn in.
+    """Return what a camera sees of the physics, with the axes of `ee` drawn in.
 
-    The x axis is red, y green, z blue. size: height and width [pixels]. The picture is RGB, uint8
-    (height, width, 3). Raises `RenderError` as `pictures` does.
+    The x axis is red, y green, z blue.
+
+    Args:
+        scene: The scene.
+        data: Its data.
+        camera: Name of the camera.
+        size: Height and width of the picture [pixels].
+        look: Lighting of the picture.
+
+    Returns:
+        The RGB picture, uint8 (height, width, 3).
+
+    Raises:
+        RenderError: If there is no off-screen OpenGL.
     """
     renderer = _renderer(scene, look)
     renderer.pose(data, scene.nominal)

@@ -35,14 +35,20 @@ _ROUND = 0.03  # largest variation of a round object's width, as a share of it
 
 
 class Rest(NamedTuple):
-    """A side on which an object rests.
+    """A side on which an object rests, and the w grasps of an object that rests on it.
 
-    down: unit vector (3,), in the object's frame, that points down when the object rests on the
-    side. Heights [m]: `height` of the body's origin over the table, `tall` of the object, `above`
-    of its top over the grasp. For each of w grasps: across (w, 3), unit vector along the fingers'
-    motion; centre (w, 3), middle between the fingers [m]; sizes, the object's width between the
-    fingers and its length at right angles to that [m]. fits: whether the object is narrow enough
-    for the open fingers, and tall enough to grip. round: whether any yaw will do.
+    Attributes:
+        down: Unit vector in the object's frame that points down when the object rests on the side,
+            (3,).
+        height: Height of the body's origin over the table [m].
+        tall: Height of the object [m].
+        above: Height of the object's top over the grasp [m].
+        across: Unit vector along the fingers' motion for each grasp, in the object's frame, (w, 3).
+        centre: Middle between the fingers for each grasp, in the object's frame, (w, 3) [m].
+        sizes: For each grasp, the object's width between the fingers and its length at right angles
+            to that [m].
+        fits: Whether the object is narrow enough for the open fingers, and tall enough to grip.
+        round: Whether any yaw will do.
     """
 
     down: F64
@@ -59,14 +65,21 @@ class Rest(NamedTuple):
 class Hull:
     """An object's convex hull, and the sides on which it rests, for one gripper.
 
-    extents: lengths of the box around it, centred on the body's origin [m]. downs: for each side
-    the unit vector that points down when the object rests on it, (n, 3); the first is the nearest
-    to down as the object was modelled.
+    Attributes:
+        extents: Lengths of the box around it, centred on the body's origin, (3,) [m].
+        downs: For each side, the unit vector that points down when the object rests on it, (n, 3);
+            the first is the nearest to down as the object was modelled.
     """
 
     def __init__(self, model: mujoco.MjModel, body: int, geom: int, lowest: float, widest: float):
-        """Use a body's mesh, and a gripper that opens to `widest` [m] and whose `ee` gets down
-        to `lowest` [m].
+        """Compute the hull of a body's mesh.
+
+        Args:
+            model: The compiled model.
+            body: Id of the body.
+            geom: Id of its geom with the mesh.
+            lowest: Least height of `ee` over the table [m].
+            widest: Opening of the open gripper [m].
         """
         points = _few(_vertices(model, geom))
         self._hull = ConvexHull(points)

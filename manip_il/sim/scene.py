@@ -43,8 +43,14 @@ _PEDESTAL = 0.13  # half the pedestal's width [m]
 def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
     """Return the scene of a robot and a task, compiled once and cached.
 
-    step: physics time step [s]. Raises `UsageError` if the scene does not compile, lacks an object
-    of the task, or has one to grasp that is too wide for the gripper.
+    Args:
+        robot: The robot.
+        task: The task, whose fixed parts are scaled to the robot.
+        step: Physics time step [s].
+
+    Raises:
+        UsageError: If the scene does not compile, lacks an object of the task, or has one to grasp
+            that does not fit the gripper.
     """
     task = task.fitted(robot)
     try:
@@ -80,7 +86,15 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
 
 
 def camera_id(model: mujoco.MjModel, name: str) -> int:
-    """Return the id of a camera of the world or on the robot. Raises `UnknownName`."""
+    """Return the id of a camera of the world or on the robot.
+
+    Args:
+        model: The compiled scene.
+        name: Name of the camera, without the robot's prefix.
+
+    Raises:
+        UnknownName: If there is no such camera.
+    """
     for prefix in ("", PREFIX):
         camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, prefix + name)
         if camera >= 0:

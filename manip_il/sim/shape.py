@@ -41,14 +41,20 @@ SHAPE_HELP = (
 
 @dataclass(frozen=True)
 class ObjectShape:
-    """A wooden solid. kind: one of `KINDS`, `mesh` or `any`.
+    """A wooden solid, or a mesh.
 
-    lengths: along its own axes x, y and z [m].
-
-    `any`: each episode draws one of `KINDS`, of the same width; a cube if nothing is drawn.
     Cylinders and capsules have their axis along z, and a capsule's length is that between the tips
-    of its round ends. Raises `UsageError` for a length outside `SHORTEST` to `LONGEST` (for a mesh,
-    only the longest counts, and it may be `LONGEST_MESH`), or a capsule no longer than wide.
+    of its round ends.
+
+    Attributes:
+        kind: One of `KINDS`, `mesh`, or `any`: each episode draws one of `KINDS`, of the same
+            width; a cube if nothing is drawn.
+        lengths: Lengths along its own axes x, y and z, (3,) [m].
+        mesh: The mesh, if it is one.
+
+    Raises:
+        UsageError: If a length is outside `SHORTEST` to `LONGEST` (for a mesh, only the longest
+            counts, and it may be `LONGEST_MESH`), or a capsule is no longer than wide.
     """
 
     kind: str
@@ -77,10 +83,14 @@ class ObjectShape:
 
     @classmethod
     def parse(cls, text: NameOrPath) -> ObjectShape:
-        """Return the shape that a text describes, or a mesh, which only a `Path` can name (see
-        `option.typed`).
+        """Return the shape that a text describes, or a mesh.
 
-        Raises `UnknownName` or `UsageError`.
+        Args:
+            text: A shape as in `SHAPE_HELP`; only a `Path` can name a mesh (see `option.typed`).
+
+        Raises:
+            UnknownName: If there is no such shape.
+            UsageError: If its lengths are wrong, or its mesh cannot be read.
         """
         if isinstance(text, Path):
             from manip_il.sim.mesh import parse_mesh  # imported here: help needs no numpy
@@ -107,7 +117,12 @@ class ObjectShape:
     def of_width(cls, kind: str, width: float) -> ObjectShape:
         """Return a cube, a sphere, a cylinder as long as wide, or a capsule 1.5 times as long.
 
-        Raises `UsageError`.
+        Args:
+            kind: One of `KINDS`, or `any`.
+            width: Its width [m].
+
+        Raises:
+            UsageError: If a length is out of range.
         """
         return cls(kind, _lengths(kind, width))
 
@@ -153,10 +168,9 @@ class ObjectShape:
 
     @property
     def sizes(self) -> tuple[float, float] | None:
-        """Range of `2 * max(size)` [m] in which the object, scaled as a whole, can be grasped
-        however it lies.
+        """Range of `2 * max(size)` [m] in which the object can be grasped however it lies.
 
-        None if that range is empty.
+        The object is scaled as a whole. None if that range is empty.
         """
         if self.mesh is not None:
             return None
@@ -181,15 +195,21 @@ def _lengths(
 
 
 def draws_shape(text: NameOrPath) -> bool:
-    """Return whether `text`, as in `ObjectShape.parse`, asks for a shape that is drawn anew in
-    each episode.
+    """Return whether an object's shape is drawn anew in each episode.
+
+    Args:
+        text: The object, as in `ObjectShape.parse`.
     """
     return str(text).partition(":")[0] == ANY
 
 
 def stored(text: NameOrPath) -> str:
-    """Return an object's text as datasets store it: for a mesh, with the file's name and hash in
-    place of its path.
+    """Return an object's text as datasets store it.
+
+    For a mesh, the file's name and hash replace its path.
+
+    Args:
+        text: The object, as in `ObjectShape.parse`.
     """
     return str(ObjectShape.parse(text)) if isinstance(text, Path) else text
 

@@ -60,9 +60,11 @@ class Rung:
 
 @dataclass(frozen=True)
 class Start:
-    """Drawn start of an episode. poses: body name -> (position (3,) [m], quaternion wxyz (4,)).
+    """Drawn start of an episode.
 
-    The bodies are objects and mocap bodies; those without a pose start where `build` put them.
+    Attributes:
+        poses: Name of a body -> its position, (3,) [m], and its quaternion wxyz, (4,). The bodies
+            are objects and mocap bodies; those without a pose start where `build` put them.
     """
 
     poses: Mapping[str, tuple[F64, F64]]
@@ -118,12 +120,21 @@ class Task(ABC):
 
     @abstractmethod
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw a start within the arm's reach. Raises `UsageError` if there is none."""
+        """Draw a start within the arm's reach.
+
+        Args:
+            rng: Generator to draw from.
+            world: The world; its variation is that of the episode.
+
+        Raises:
+            UsageError: If there is no start within reach.
+        """
 
     @abstractmethod
     def observe(self, world: World) -> Observed:
-        """Return the entries of `environment_state` by name, in its order: numbers, and vectors
-        of x, y and z.
+        """Return the entries of `environment_state` by name, in its order.
+
+        Each is a number, or a vector of x, y and z.
         """
 
     @abstractmethod
@@ -162,7 +173,11 @@ class Task(ABC):
     def with_shape(self, shape: ObjectShape) -> Self:
         """Return this task with an object of another shape.
 
-        Raises `UsageError` if it takes none.
+        Args:
+            shape: The shape.
+
+        Raises:
+            UsageError: If the task takes no other object.
         """
         raise UsageError(
             f"object is {shape}, but the objects of {self.name} are fixed; omit --task.object"
@@ -171,7 +186,11 @@ class Task(ABC):
     def with_argument(self, text: NameOrPath) -> Self:
         """Return the variant `NAME:ARGUMENT`, whose `name` holds the argument.
 
-        Raises `UsageError` if it takes none.
+        Args:
+            text: The argument.
+
+        Raises:
+            UsageError: If the task takes no argument.
         """
         raise UsageError(
             f"task is {self.name}:{text}, but {self.name} takes no argument after a colon"
@@ -179,8 +198,9 @@ class Task(ABC):
 
 
 def phases(task: Task) -> tuple[str, ...]:
-    """Return the names of a task's phases, in the order of `expert_phase`: `none`, then the
-    rungs, earliest first.
+    """Return the names of a task's phases, in the order of `expert_phase`.
+
+    The first is `none`; the rungs follow, earliest first.
     """
     return (NO_PHASE, *(rung.name for rung in reversed(task.rungs)))
 

@@ -42,7 +42,12 @@ _NOT_PHYSICS = WORLD_SIZE - RANGES["posture"].places[0]
 class Object:
     """A free body of a compiled model, and its first geom, which gives its shape.
 
-    q, v: where its free joint starts in qpos and qvel.
+    Attributes:
+        name: Name of the body.
+        body: Id of the body.
+        geom: Id of the geom.
+        q: Where its free joint starts in `qpos`.
+        v: Where its free joint starts in `qvel`.
     """
 
     name: str
@@ -62,15 +67,24 @@ def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
 
 
 def part(variation: F64, name: str) -> F64:
-    """Return the numbers of one quantity of `RANGES`, such as `table` or `clutter`, in a
-    variation (v,).
+    """Return the numbers of one quantity in a variation.
+
+    Args:
+        variation: The variation, (v,).
+        name: A name in `RANGES`, such as `table` or `clutter`.
     """
     return _world(variation)[RANGES[name].places]
 
 
 def seen_objects(variation: F64) -> tuple[F64, int | None]:
-    """Return `geom_size` of all objects, (o, 3) [m], and their MuJoCo geom type, None unless a
-    shape was drawn.
+    """Return the sizes of all objects and their shape.
+
+    Args:
+        variation: The variation, (v,).
+
+    Returns:
+        `geom_size` of each object, (o, 3) [m], and MuJoCo's geom type of all, None unless a shape
+        was drawn.
     """
     shape = float(_world(variation)[_SHAPE])
     return _objects(variation)[:, _SIZE], None if shape == OWN else int(shape)
@@ -90,12 +104,15 @@ def same_physics(variation: F64, other: F64) -> bool:
 
 
 def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
-    """Return `base` (v,) with the values in `drawn`, whose names and units are those of
-    `Condition`.
+    """Return a variation with the values that a condition drew, (v,).
 
-    Names of other quantities change nothing. size is the edge or width [m]. An object of a drawn
-    shape has the mass of a wooden one, unless a mass is drawn. camera_shift and camera_turn have a
-    vector (3,) per camera.
+    An object of a drawn shape has the mass of a wooden one, unless a mass is drawn.
+
+    Args:
+        base: The variation to start from, (v,).
+        drawn: Values, by the names and in the units of `Condition`; size is the edge or width [m],
+            and camera_shift and camera_turn have a vector (3,) per camera. Names of other
+            quantities change nothing.
     """
     varied = base.copy()
     rows, world = _objects(varied), _world(varied)
@@ -125,10 +142,16 @@ def apply(
     motors: I64,
     variation: F64,
 ) -> None:
-    """Apply `variation` (v,) to the objects and the arm of a model that is not shared.
+    """Apply a variation to the objects and the arm of a model that is not shared.
 
-    plain: the model as compiled. motors: actuators of the arm's joints, (arm,). Call `mj_setConst`
-    afterwards: it updates what depends on masses.
+    Call `mj_setConst` afterwards: it updates what depends on masses.
+
+    Args:
+        model: The model, changed in place.
+        plain: The model as compiled.
+        objects: The model's objects, by name, in the order of the variation.
+        motors: Ids of the actuators of the arm's joints, (arm,).
+        variation: The variation, (v,).
     """
     # kv changes by the square root of kp's factor, which keeps the damping ratio.
     damping, gain = part(variation, "joint_damping"), part(variation, "actuator_gain")

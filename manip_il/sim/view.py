@@ -50,13 +50,20 @@ _CHANGED = (
 
 
 class ViewModel:
-    """A model to draw from, not to simulate: every name, address and pose in `model` is the physics
-    model's.
+    """A model to draw from, not to simulate.
 
-    fine: keep every face of the meshes.
+    Attributes:
+        model: The model; every name, address and pose in it is the physics model's.
     """
 
     def __init__(self, scene: Scene, look: Look, *, fine: bool = False):
+        """Copy the scene's model and light it.
+
+        Args:
+            scene: The scene.
+            look: Lighting.
+            fine: Whether to keep every face of the meshes.
+        """
         self.model: Any = copy.copy(scene.model if fine else _with_few_faces(scene))
         self.model.vis.quality.offsamples = 0  # the renderer smooths edges itself
         if not look.shadows:
@@ -68,8 +75,12 @@ class ViewModel:
         self._applied = scene.nominal
 
     def apply(self, variation: F64) -> None:
-        """Apply the look of a variation (v,) to the next pictures, without uploading anything to
-        the graphics card.
+        """Apply the look of a variation to the next pictures.
+
+        Nothing is uploaded to the graphics card.
+
+        Args:
+            variation: The variation, (v,).
         """
         if np.array_equal(variation, self._applied):
             return
@@ -124,8 +135,11 @@ def _with_few_faces(scene: Scene) -> mujoco.MjModel:
 
 
 def simplify_meshes(model: mujoco.MjModel, finest: float) -> None:
-    """Reduce the faces of large meshes in a model that is only drawn. finest: least size of a
-    grid cell [m].
+    """Reduce the faces of large meshes in a model that is only drawn.
+
+    Args:
+        model: The model, changed in place.
+        finest: Least size of a grid cell [m].
     """
     for mesh in range(model.nmesh):
         if model.mesh_facenum[mesh] > _PLAIN_FACES:
@@ -154,12 +168,19 @@ def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
 def cluster(
     vertices: F64, faces: Indices, finest: float = _LEAST_CELL
 ) -> tuple[F64, Indices, Indices]:
-    """Merge vertices (v, 3) that share a grid cell.
+    """Merge the vertices of a mesh that share a grid cell.
 
-    Return positions (c, 3), indices of originals (c,), faces (f, 3).
+    The original of a cell is the vertex nearest to the mean of its vertices; the original's normal
+    shades the coarse mesh like the fine one.
 
-    finest: least size of a cell [m]. The original of a cell is the vertex nearest to the mean of
-    its vertices; the original's normal shades the coarse mesh like the fine one.
+    Args:
+        vertices: Positions of the vertices, (v, 3) [m].
+        faces: Indices of the vertices of each triangle, (f, 3).
+        finest: Least size of a cell [m].
+
+    Returns:
+        Positions of the merged vertices, (c, 3) [m]; indices of their originals, (c,); and the
+        faces that are left, which index the merged vertices, at most f.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = max(float(np.linalg.norm(high - low)) / _CELLS, finest)

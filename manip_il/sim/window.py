@@ -36,8 +36,12 @@ def has_display() -> bool:
 
 
 def require_display() -> None:
-    """Raise `RenderError` if no window can be opened: MuJoCo's viewer would end the process, or
-    wait forever.
+    """Check that a window can be opened.
+
+    Without this, MuJoCo's viewer would end the process, or wait forever.
+
+    Raises:
+        RenderError: If no window can be opened.
     """
     import glfw  # MuJoCo's own
 
@@ -67,13 +71,19 @@ class Clock:
 
 
 class Window:
-    """A window that shows a scene, `control_hz` times a second.
-
-    sliders: open the right panel, which has the control sliders. Raises `RenderError` if there is
-    no display.
-    """
+    """A window that shows a scene in real time."""
 
     def __init__(self, scene: Scene, control_hz: float, *, sliders: bool = False):
+        """Open the window.
+
+        Args:
+            scene: The scene.
+            control_hz: How often per second `show` is called.
+            sliders: Whether to open the right panel, which has the control sliders.
+
+        Raises:
+            RenderError: If there is no display.
+        """
         require_display()
         import mujoco.viewer
 
@@ -101,8 +111,12 @@ class Window:
         return self._handle.is_running()
 
     def show(self, data: mujoco.MjData, variation: F64, text: str = "") -> None:
-        """Show `data` in the look of `variation` (v,), then wait for real time. text: shown in
-        the upper left.
+        """Show the physics, then wait for real time; do nothing if the window is closed.
+
+        Args:
+            data: The scene's data.
+            variation: The world's variation, (v,), whose look is shown.
+            text: Text shown in the upper left.
         """
         if not self.is_open:
             return
@@ -119,8 +133,9 @@ class Window:
 
     @property
     def commands(self) -> F64:
-        """Positions of the control sliders, in the actuators' units, (u,): as shown last, or as
-        moved since.
+        """Positions of the control sliders, in the actuators' units, (u,).
+
+        They are as shown last, or as moved since.
         """
         return self._data.ctrl.copy()
 

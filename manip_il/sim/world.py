@@ -48,10 +48,20 @@ class Pose(NamedTuple):
 class Scene:
     """A robot and a task's objects as one compiled model, and the addresses of its named parts.
 
-    task: the `Task`. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free
-    bodies by name. hulls: convex hulls, by name, of the objects that are meshes. ee_site, shoulder:
-    ids of the site `ee` and of the arm's first joint. yaws: least and greatest yaw of the hand,
-    relative to `World.ahead` [rad]. nominal: the variation of the model as compiled, (v,).
+    Attributes:
+        robot: The robot.
+        task: The `Task`.
+        model: The compiled model.
+        gripper: The robot's gripper in the model.
+        actions: Names and bounds of actions.
+        objects: Free bodies, by name.
+        arm_q: Indices of the arm's joints into `qpos`, (arm,).
+        arm_ctrl: Indices of the arm's actuators into `ctrl`, (arm,).
+        ee_site: Id of the site `ee`.
+        shoulder: Id of the arm's first joint.
+        yaws: Least and greatest yaw of the hand, relative to `World.ahead` [rad].
+        nominal: The variation of the model as compiled, (v,).
+        hulls: Convex hulls, by name, of the objects that are meshes.
     """
 
     robot: Robot
@@ -85,9 +95,7 @@ class Scene:
 
     @cached_property
     def furniture(self) -> I64:
-        """The numbers of the geoms of mocap bodies, (g,): goal markers and the fixed parts of
-        the task.
-        """
+        """Ids of the geoms of mocap bodies, (g,): goal markers and the fixed parts of the task."""
         return np.flatnonzero(
             self.model.body_mocapid[self.model.body_rootid[self.model.geom_bodyid]] >= 0
         )
@@ -101,9 +109,17 @@ class Scene:
 class World:
     """One scene's physics, and what can be read from it by name.
 
-    model, data: replaced as the variation changes; the model is the scene's shared one or this
-    world's own copy. ee: the frame between the fingertips, z out of the hand, y along the fingers'
-    motion. Poses need up-to-date kinematics (`update`).
+    Poses need up-to-date kinematics (`update`).
+
+    Attributes:
+        scene: The scene.
+        robot: Its robot.
+        gripper: Its gripper.
+        variation: How the world differs from the compiled model, (v,).
+        model: The scene's shared model, or this world's own copy; replaced as the variation
+            changes.
+        data: The model's data, replaced with it.
+        ee: The frame between the fingertips, z out of the hand, y along the fingers' motion.
     """
 
     def __init__(self, scene: Scene):
@@ -131,9 +147,13 @@ class World:
     # Physics
 
     def vary(self, variation: F64) -> None:
-        """Apply the physics of `variation` (v,) to the model.
+        """Apply the physics of a variation to the model.
 
-        Raises `MismatchError` for one of another length.
+        Args:
+            variation: The variation, (v,).
+
+        Raises:
+            MismatchError: If the variation has another length than the scene's.
         """
         if len(variation) != (size := len(self.scene.nominal)):
             raise MismatchError(
@@ -162,9 +182,14 @@ class World:
         return physics
 
     def restore(self, physics: F64, variation: F64) -> None:
-        """Restore physics (p,) and variation (v,), bit for bit.
+        """Restore a state, bit for bit.
 
-        Raises `MismatchError` for those of another scene.
+        Args:
+            physics: MuJoCo's integration state, (p,), as `physics` returned it.
+            variation: The variation, (v,).
+
+        Raises:
+            MismatchError: If the state is one of another scene.
         """
         size = self.scene.state_size
         if len(physics) != size:
@@ -181,9 +206,16 @@ class World:
         mujoco.mj_kinematics(self.model, self.data)
 
     def place(self, name: str, position: F64, quaternion: F64) -> None:
-        """Place an object (at rest) or mocap body: position (3,) [m], quaternion wxyz (4,).
+        """Place an object (at rest) or a mocap body. Call `update` next.
 
-        Call `update` next.
+        Args:
+            name: Name of the object or body.
+            position: Its position in the world, (3,) [m].
+            quaternion: Its rotation in the world, wxyz, (4,).
+
+        Raises:
+            UnknownName: If there is no body of this name.
+            ManipError: If it is neither an object nor a mocap body.
         """
         if name in self.scene.objects:
             placed = self.scene.objects[name]
@@ -204,7 +236,14 @@ class World:
         return self._cache[key]
 
     def pose(self, name: str) -> Pose:
-        """Return the pose of a body, as views that follow the world. Raises `UnknownName`."""
+        """Return the pose of a body, as views that follow the world.
+
+        Args:
+            name: Name of the body.
+
+        Raises:
+            UnknownName: If there is no body of this name.
+        """
         pose = self._poses.get(name)
         if pose is None:
             body = self._body(name).id
@@ -237,11 +276,16 @@ class World:
         return yaw_ahead(self.robot, self.data.xanchor[self.scene.shoulder], position)
 
     def turns(self, yaw: float, alike: float, position: F64) -> list[float]:
-        """Return the yaws relative to `ahead` [rad] that bring a hand at a position (3,) [m] to
-        `yaw` or an equivalent.
+        """Return the hand's yaws, relative to `ahead`, that suit a grasp at a position.
 
-        alike: turn after which the grasp looks the same [rad]. If none is in the arm's range,
-        return the one nearest to `ahead`.
+        Args:
+            yaw: A yaw of the hand in the world that suits the grasp [rad].
+            alike: Turn after which the grasp looks the same [rad].
+            position: Position of the hand, (3,) [m].
+
+        Returns:
+            The yaws [rad] in the arm's range that are equivalent to `yaw`; if there are none, or if
+            the hand turns without limits, only the one nearest to `ahead`.
         """
         low, high = self.scene.yaws
         off = math.remainder(yaw - self.ahead(position), alike)
@@ -306,11 +350,14 @@ class World:
         )
 
     def neighbours(self, name: str) -> list[tuple[float, float]]:
-        """Return the offsets (x, y) [m] from an object's centre to the nearest point of each
-        neighbour within 8 cm.
+        """Return the offsets (x, y) [m] from an object to its neighbours within 8 cm.
 
-        Neighbours are furniture and other objects that a hand over the object could hit, taken as
-        axis-aligned boxes.
+        Each is from the object's centre to the nearest point of the neighbour. Neighbours are
+        furniture and other objects that a hand over the object could hit, taken as axis-aligned
+        boxes.
+
+        Args:
+            name: Name of the object.
         """
         others = self._standing[name]
         if not len(others):
