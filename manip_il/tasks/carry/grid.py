@@ -108,9 +108,18 @@ def plan_edges(problem: PathProblem, costs: F64) -> Plan:
 
 
 def cheapest_path(problem: PathProblem, planned: Plan, start: int) -> tuple[I64, F64]:
-    """Return the nodes (n,) and feature sums (K,) of a plan's path from node `start`.
+    """Return a plan's path from a node to the goal.
 
-    Raises `ManipError` if no path leads to the goal.
+    Args:
+        problem: The graph and its features.
+        planned: The plan for this problem.
+        start: The number of the node where the path begins.
+
+    Returns:
+        The path's nodes (n,), of which the last is the goal, and its feature sums (K,).
+
+    Raises:
+        ManipError: If no path leads from `start` to the goal.
     """
     if not np.isfinite(planned.costs[start]):
         raise ManipError(f"no path leads from node {start} to the goal")
@@ -159,8 +168,16 @@ def rivals(demonstrations: Sequence[Demonstration], tastes: F64) -> list[F64]:
 def add_rivals(
     demonstrations: Sequence[Demonstration], sums: Sequence[F64], tastes: F64
 ) -> list[F64]:
-    """Return the `sums` of `rivals`, (m, K) each, with the alternatives for further weight
-    vectors `tastes` (n, K).
+    """Add the alternatives for further weight vectors to the result of `rivals`.
+
+    Args:
+        demonstrations: The demonstrated paths.
+        sums: The feature sums known so far, (m, K) for each demonstration.
+        tastes: The further weight vectors, (n, K).
+
+    Returns:
+        The distinct feature sums for each demonstration, at most (m + n, K), in which the known
+        ones come first.
     """
     found = []
     for one, known in zip(demonstrations, sums, strict=True):
@@ -456,9 +473,12 @@ class Descent:
 
 @lru_cache(KEPT)
 def descent(layout: Layout, reward: Reward, robot: Robot) -> Descent:
-    """Return a layout's costs-to-go for a reward, as a `Descent` to the goal.
+    """Return a layout's costs-to-go for a reward, which are cached once computed.
 
-    Computed once and cached.
+    Args:
+        layout: What stands on the table, and the goal.
+        reward: What a metre of path costs.
+        robot: The arm, whose reach bounds the grid.
     """
     grid, weights = Grid(layout, robot), np.array(reward.weights)
     return Descent(grid, grid.costs_to_go(weights), weights)

@@ -146,8 +146,14 @@ class Layout:
         return found
 
     def is_free(self, start: F64, end: F64, spare: float) -> bool:
-        """Return whether `room` is at least `spare` [m] all along the straight line from `start`
-        to `end`, (3,) [m].
+        """Return whether an object may be carried along a straight line.
+
+        The clearance is checked at points that are at most 2 `STEP` apart.
+
+        Args:
+            start: The line's first point, (3,) [m].
+            end: The line's last point, (3,) [m].
+            spare: The least `room` that is required along the line [m].
         """
         pieces = max(1, math.ceil(np.linalg.norm(end - start) / (2 * STEP)))
         return bool(

@@ -128,10 +128,15 @@ def make_layout(
     places: Mapping[str, F64],
     edge: tuple[F64, F64] | None,
 ) -> Layout:
-    """Return the layout for an object of lengths (3,) [m], a goal (3,) [m], places of obstacles
-    (3,) [m], and an edge.
+    """Return the layout for an object, its goal, and what stands on the table.
 
-    edge: a point on it (3,) [m] and the direction away from the table, (3,).
+    Args:
+        scene: The scene, whose robot gives the obstacles' scale and the parts of the hand.
+        lengths: The object's lengths along its axes, (3,) [m].
+        goal: The target of the object's centre, (3,) [m].
+        places: The positions of the obstacles that are present, (3,) [m] each, by name.
+        edge: A point on the table's edge, (3,) [m], and the direction away from the table, (3,);
+            None if the edge is not near.
     """
     _, middle, longest = sorted(lengths)
     own = Part(-longest / 2, math.hypot(middle, longest) / 2)
@@ -148,9 +153,12 @@ def make_layout(
 
 
 def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layout:
-    """Return the layout that an observation describes. name: the object's.
+    """Return the layout that an observation describes.
 
-    seen: `environment_state` by name.
+    Args:
+        scene: The scene that was observed.
+        name: The name of the object that is carried.
+        seen: The numbers of `environment_state`, by name.
     """
 
     def vector(of: str) -> F64:
@@ -238,8 +246,13 @@ def _box(points: F64, axes: F64) -> Box:
 
 
 def fits(hand: HandShape, at: Sequence[float], yaw: float, layout: Layout) -> bool:
-    """Return whether a downward hand, `ee` at a place (3,) [m] and a yaw [rad], is clear of a
-    layout's obstacles.
+    """Return whether a downward hand is clear of all obstacles.
+
+    Args:
+        hand: The shape of the hand.
+        at: The position of `ee`, (3,) [m].
+        yaw: The yaw of the hand [rad].
+        layout: The layout, of which only the obstacles count.
     """
     # the hand's x and y
     axes = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])
