@@ -100,8 +100,9 @@ def at_grasp(world: World, name: str) -> bool:
 
 
 def rise_first(at: F64, to: Sequence[float] | F64) -> F64:
-    """Return the next target from a point (3,) towards another, (3,) [m]: straight up if far
-    below the other.
+    """Return the next target from a point (3,) towards another, (3,) [m].
+
+    It is straight up if the point is far below the other.
     """
     (x, y, z), (to_x, to_y, to_z) = at.tolist(), to
     sideways = share(1.0 - (to_z - z) / RISE_FIRST)
@@ -257,8 +258,9 @@ def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.
 
 
 def pick_progress(world: World, name: str) -> float:
-    """Return progress of grasping an object and carrying it to the goal, 0 to 1, by the distance
-    left on that path.
+    """Return how far an object has come on its way to the grasp and the goal, 0 to 1.
+
+    It depends on the distance left on that path.
     """
     if is_held(world, name):
         return _GRASPED + (1 - _GRASPED) * carry_progress(world, name, world.goal)

@@ -89,8 +89,9 @@ class Grip(NamedTuple):
 
 
 def hand_at(yaw: float, pitch: float) -> F64:
-    """Return `ee`'s rotation (3, 3): the hand points down at `pitch` 0, and level, along `yaw`,
-    at pi/2 [rad].
+    """Return the rotation of `ee`, (3, 3), at a yaw and a pitch [rad].
+
+    The hand points down at a pitch of 0, and level along `yaw` at a pitch of pi/2.
     """
     c, s = math.cos(yaw), math.sin(yaw)
     level, upright = math.cos(pitch), math.sin(pitch)
@@ -135,8 +136,9 @@ def stands(world: World) -> bool:
 
 @once_per_state
 def holds_peg(world: World) -> bool:
-    """Return whether both fingers touch the peg, and the hand is within the peg's faces and ends
-    or just outside.
+    """Return whether the hand holds the peg.
+
+    Both fingers touch the peg, and the hand is within the peg's faces and ends or just outside.
     """
     if not world.touched(PEG):
         return False
@@ -305,9 +307,7 @@ def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool
 
 
 def is_up(world: World) -> bool:
-    """Return whether the peg stands on the table, with an oblique hand around it or just above
-    it.
-    """
+    """Return whether the peg stands on the table, with an oblique hand at it or just above it."""
     x, y, z = (world.ee.position - lower_end(world)).tolist()
     up = float(upper_axis(world)[2]) > math.cos(0.15) and lower_end(world)[2] < ON_TABLE
     return up and is_aslant(world) and math.hypot(x, y) < 0.03 and z < world.extents(PEG)[2] + CLEAR

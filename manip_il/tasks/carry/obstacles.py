@@ -54,8 +54,9 @@ _LOOKS = {  # visual geoms: kind, half size and middle in shares of the obstacle
 
 
 def add_obstacles(spec: mujoco.MjSpec, scale: float) -> None:
-    """Add the obstacles, their contact boxes, the table's edge, and bodies whose positions are
-    the reward's weights.
+    """Add the obstacles and the table's edge, with all that they need.
+
+    The obstacles have contact boxes. The positions of further bodies hold the reward's weights.
     """
     for name, obstacle in OBSTACLES.items():
         body = add_furniture(spec, name)
@@ -172,8 +173,9 @@ def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layou
 
 
 def observe_obstacles(world: World) -> dict[str, F64 | float]:
-    """Return all obstacles' positions [m] and presence, and the table's edge: a point on it, its
-    outward axis.
+    """Return the position [m] and presence of every obstacle and of the table's edge.
+
+    The edge's position is a point on it; its outward axis is returned as well.
     """
     found: dict[str, F64 | float] = {}
     for name in (*OBSTACLES, EDGE):
@@ -184,8 +186,10 @@ def observe_obstacles(world: World) -> dict[str, F64 | float]:
 class Box(NamedTuple):
     """Upright box around a part of the hand, relative to `ee`.
 
-    bottom: height of its lowest point [m]. middle, half: centre and half-lengths along the hand's x
-    and y, (2,) [m].
+    Attributes:
+        bottom: The height of its lowest point [m].
+        middle: Its centre along the hand's x and y, (2,) [m].
+        half: Half its lengths along the hand's x and y, (2,) [m].
     """
 
     bottom: float
@@ -194,11 +198,12 @@ class Box(NamedTuple):
 
 
 class HandShape(NamedTuple):
-    """The open, downward hand. parts: lowest points and radii about the vertical through `ee`.
+    """The open hand that points down.
 
-    boxes: one per geom.
-
-    home: position of `ee` in the arm's home pose, (3,) [m].
+    Attributes:
+        parts: The lowest points and radii of its parts about the vertical through `ee`.
+        boxes: A box around each geom.
+        home: The position of `ee` in the arm's home pose, (3,) [m].
     """
 
     parts: tuple[Part, ...]
