@@ -27,9 +27,13 @@ _RISE = 0.10  # height of the hand over an object after release [m]
 def add_bin(
     spec: mujoco.MjSpec, name: str, inside: tuple[float, float], colour: tuple[float, ...] = WOOD
 ) -> None:
-    """Add an open box.
+    """Add an open box, whose pose is set at the start of an episode.
 
-    Its pose is set at the start of an episode. inside: half its inner length and width [m].
+    Args:
+        spec: The scene to add it to.
+        name: The name of its body.
+        inside: Half its inner length and width, (2,) [m].
+        colour: Red, green and blue, 0 to 1.
     """
     box, high = add_furniture(spec, name), WALL / 2
     length, width = inside
@@ -43,7 +47,14 @@ def add_bin(
 
 
 def is_in(world: World, name: str, box: str, inside: tuple[float, float]) -> bool:
-    """Return whether an object's centre is between a box's walls."""
+    """Return whether an object's centre is between a box's walls.
+
+    Args:
+        world: The world to look at.
+        name: The object's name.
+        box: The box's name.
+        inside: Half the box's inner length and width, along the world's x and y, (2,) [m].
+    """
     x, y, z = (world.at(name) - world.at(box)).tolist()
     return abs(x) < inside[0] and abs(y) < inside[1] and z < WALL + 0.01
 
@@ -61,11 +72,18 @@ def drop_rungs(
     names: Sequence[str],
     lift: LiftProfile = OVER_WALL,
 ) -> tuple[Rung, ...]:
-    """Return the rungs that carry the current object to its release point over a box and drop it
-    in.
+    """Return the rungs that carry the current object over a box and drop it in.
 
-    which: returns the current object; to: where to release its centre [m]; is_done: whether an
-    object is in its box.
+    Args:
+        which: Returns the name of the current object.
+        to: Returns where to release that object's centre, (3,) [m].
+        is_done: Returns whether the object of a given name is in its box.
+        names: All objects that may be in the hand. The one nearest to the hand is let go once
+            it is in its box.
+        lift: The height of the object on its way to the box.
+
+    Returns:
+        The rungs `let_go` and `carry`, in this order.
     """
 
     def nearest(world: World) -> str:
@@ -88,9 +106,14 @@ def rise_over(world: World, box: str) -> Target:
 
 
 def drop_place(world: World, name: str, box: str, offset: Sequence[float] = (0.0, 0.0)) -> F64:
-    """Return where to release an object over a box, (3,) [m].
+    """Return where to release an object's centre over a box, (3,) [m].
 
-    offset: from the middle of its floor, (2,) [m].
+    Args:
+        world: The world to look at.
+        name: The object's name.
+        box: The box's name.
+        offset: The place's offset from the middle of the box's floor along the world's x and y,
+            (2,) [m].
     """
     height = 2 * THIN + lie_of(world, name).tall / 2 + DROP
     return world.at(box) + [offset[0], offset[1], height]

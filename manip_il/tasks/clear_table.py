@@ -111,8 +111,9 @@ class ClearTable(Task):
         return Start({BOX: (box, UPRIGHT), **cubes})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, box, next cube, the vector to its place, each cube's position, and
-        whether it is in the box.
+        """Return the hand, the box, the next cube and the vector to its place, and all cubes.
+
+        Of each cube it returns the position, and whether it is in the box.
         """
         name = current(world)
         return {
@@ -128,9 +129,7 @@ class ClearTable(Task):
         }
 
     def error(self, world: World) -> float:
-        """Return the distance from the box's middle, summed over the cubes that are not inside
-        [m].
-        """
+        """Return the distance from the box's middle, summed over the cubes that are outside [m]."""
         at = world.at(BOX)
         return sum(math.dist(world.at(name), at) for name in _left(world))
 

@@ -288,8 +288,9 @@ class Drawer(Task):
         add_cabinet(spec)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw where the cabinet stands, left or right, and the cube beside its drawer, at any
-        yaw.
+        """Draw where the cabinet stands, left or right, and the cube beside its drawer.
+
+        The cube has any yaw.
         """
         x, y = world.robot.workspace.centre
         side = rng.choice([-1.0, 1.0])
@@ -302,9 +303,7 @@ class Drawer(Task):
         return Start({OBJECT: (at, draw_yaw(rng)), CABINET: (cabinet, UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, cube and handle, how far the drawer is open, and the vectors between
-        them.
-        """
+        """Return the hand, the cube, the handle, the vectors between them, and the opening [m]."""
         bar = hand_at_handle(world)
         return {
             **observe_hand(world),
@@ -316,8 +315,9 @@ class Drawer(Task):
         }
 
     def error(self, world: World) -> float:
-        """Return how far the drawer is open, plus the object's distance from the drawer's middle
-        (0 if inside) [m].
+        """Return how far the drawer is open, plus the object's distance from it [m].
+
+        This is the distance from the drawer's middle, or 0 if the object is inside.
         """
         missing = (
             0.0 if is_in_drawer(world) else math.dist(world.at(OBJECT), middle_of_drawer(world))

@@ -50,12 +50,17 @@ Way = tuple[float, float, float]
 class Lie(NamedTuple):
     """Ways to grasp an object as it lies.
 
-    grasps: for each, the yaw of a downward hand [rad], the object's width between the fingers and
-    length across them [m], and the vector from its centre to the middle between them, (3,) [m].
-    tall: its height [m]. tilt: angle to its nearest resting pose [rad]. folds: number of its yaws
-    that look alike, 0 if all do. level: the grasps with fingers on upright sides. above: height of
-    its top over the middle between the fingers, by default half `tall` [m]. fits: whether the
-    gripper can close around it, if that was checked.
+    Attributes:
+        grasps: For each way, the yaw of a downward hand [rad], the object's width between the
+            fingers and length across them [m], and the vector from its centre to the middle between
+            them, (3,) [m].
+        tall: The object's height [m].
+        tilt: The angle to its nearest resting pose [rad].
+        folds: The number of its yaws that look alike, 0 if all do.
+        level: The slice of `grasps` in which the fingers meet upright sides.
+        above: The height of its top over the middle between the fingers, by default half `tall`
+            [m].
+        fits: Whether the gripper can close around it, if that was checked.
     """
 
     grasps: tuple[tuple[float, float, float, Way], ...]
@@ -75,14 +80,24 @@ class Lie(NamedTuple):
 class Grasp(NamedTuple):
     """How to grasp an object, and how far the hand is from that grasp.
 
-    offset: of the place to grasp from the middle between the holding pads, in frame `ee` [m].
-    width, length: its size between the fingers and across them [m]; half: height of its top over
-    that place [m]. settled: it rests on a face, leans on something without moving, or is between
-    the fingers. yaw: a downward hand's yaw to grasp it; angle: the hand's angle to that pose [rad].
-    at: position of `ee` to grasp it [m]. wide: opening of the fingers on approach [m]. open_enough:
-    whether they pass on both sides of it. off: misalignment of the hand, distance and angle as one
-    length [m]. funnel: height over `at` that `off` requires [m]; height: the same, but at most what
-    clears the object's top [m]. lean: how much the hand leans to reach it, 0 to 1.
+    Attributes:
+        offset: The offset of the place to grasp from the middle between the holding pads, in frame
+            `ee`, (3,) [m].
+        width: The object's size between the fingers [m].
+        length: The object's size across the fingers [m].
+        half: The height of its top over the place to grasp [m].
+        settled: Whether it rests on a face, leans on something without moving, or is between the
+            fingers.
+        yaw: The yaw of a downward hand that grasps it [rad].
+        angle: The angle of the hand to that pose [rad].
+        at: The position of `ee` that grasps it, (3,) [m].
+        wide: The opening of the fingers on approach [m].
+        open_enough: Whether the fingers pass on both sides of it.
+        off: The misalignment of the hand, distance and angle as one length [m].
+        height: The height over `at` that `off` requires, but at most what clears the object's top
+            [m].
+        funnel: The height over `at` that `off` requires [m].
+        lean: How much the hand leans to reach it, 0 to 1.
     """
 
     offset: tuple[float, float, float]
@@ -107,8 +122,10 @@ def is_cube(world: World, name: str) -> bool:
 
 
 def once_per_state[F: Callable[..., Any]](compute: F) -> F:
-    """Return `compute`, a function of a world and names in it, with each result cached until the
-    world changes.
+    """Return a function whose results are cached until the world changes.
+
+    Args:
+        compute: A function of a world and of names in it.
     """
 
     @wraps(compute)

@@ -60,8 +60,9 @@ def is_inserted(world: World) -> bool:
 
 @once_per_state
 def to_hole(world: World) -> Way:
-    """Return the remaining motion of a hanging peg into the hole, in the easiest of the four
-    rotations that fit.
+    """Return the remaining motion of a hanging peg into the hole.
+
+    Of the four rotations that fit, it takes the easiest.
     """
     peg = world.pose(PEG)
     hole = world.pose(HOLE)
@@ -120,7 +121,11 @@ def _insert_or_stay(world: World) -> Target:
 
 @dataclass(frozen=True)
 class Insert(Task):
-    """Put a peg into a hole that it fits. play: how much wider the hole is than the peg [m]."""
+    """Put a peg into a hole that it fits.
+
+    Attributes:
+        play: How much wider the hole is than the peg [m].
+    """
 
     name: str = "insert"
     instruction: str = "Put the peg into the hole."
@@ -145,8 +150,9 @@ class Insert(Task):
             _add_wall(hole, f"hole {side}", quarter * _QUARTER, inner)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the hole's place and yaw, and the peg away from it, lying half of the time, at
-        any yaw.
+        """Draw the hole's place and yaw, and the peg away from it.
+
+        The peg lies half of the time, and has any yaw.
         """
         centre = world.robot.workspace.centre
         side, _, length = world.extents(PEG)
@@ -170,8 +176,9 @@ class Insert(Task):
         return Start({PEG: (peg, turn), HOLE: (hole, draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, peg, hole, the vectors between them, and the hand's remaining rotation
-        vector [rad].
+        """Return the hand, the peg, the hole, and the vectors between them.
+
+        The hand's remaining rotation vector [rad] is returned as well.
         """
         peg, hole = world.at(PEG), world.pose(HOLE)
         peg_yaw, yaw = lie_of(world, PEG).yaw, angle_ahead(hole.rotation)

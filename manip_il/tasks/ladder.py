@@ -41,11 +41,14 @@ _GRASPED = 0.5  # progress of an object that is held
 
 
 class LiftProfile(NamedTuple):
-    """Height of a carried object over its goal, by the horizontal distance still to go [m].
+    """Height of a carried object over its goal, by the horizontal distance still to go.
 
-    most: height far from the goal [m]. slope: height per metre beyond `free`, the distance up to
-    which it is 0 [m]. rise_first: an object this far below that height, or farther, only rises [m].
-    max_step: see `Target` [m].
+    Attributes:
+        most: The height far from the goal [m].
+        slope: The height per metre of distance beyond `free`.
+        free: The distance from the goal up to which the height is 0 [m].
+        rise_first: An object this far below that height, or farther, only rises [m].
+        max_step: How far a single step may aim, see `Target` [m].
     """
 
     most: float = 0.05
@@ -97,8 +100,9 @@ def at_grasp(world: World, name: str) -> bool:
 
 
 def rise_first(at: F64, to: Sequence[float] | F64) -> F64:
-    """Return the next target from a point (3,) towards another, (3,) [m]: straight up if far
-    below the other.
+    """Return the next target from a point (3,) towards another, (3,) [m].
+
+    It is straight up if the point is far below the other.
     """
     (x, y, z), (to_x, to_y, to_z) = at.tolist(), to
     sideways = share(1.0 - (to_z - z) / RISE_FIRST)
@@ -106,12 +110,16 @@ def rise_first(at: F64, to: Sequence[float] | F64) -> F64:
 
 
 def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> Target:
-    """Approach from above: over the object and down around it, fingers open.
+    """Return the target that brings the open hand over an object and down around it.
 
-    A hand too low beside it only rises.
+    A hand that is too low beside the object only rises.
 
-    hover: height over the grasp on the way there, if more than what clears the object's top [m];
-    rise: least height over the grasp [m].
+    Args:
+        world: The world to look at.
+        name: The object's name.
+        hover: The height over the grasp on the way there, if this is more than the height that
+            clears the object's top [m].
+        rise: The least height over the grasp [m].
     """
     g = grasp_of(world, name)
     x, y, z = g.at
@@ -134,7 +142,14 @@ def close_on(world: World, name: str) -> Target:
 
 
 def carry(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) -> Target:
-    """Carry the held object's centre to a point (3,) [m]: first above that point, then down."""
+    """Return the target that carries the held object over a point, then down to it.
+
+    Args:
+        world: The world to look at.
+        name: The object's name.
+        to: The target of the object's centre, (3,) [m].
+        lift: The height of the object on its way there.
+    """
     x, y, z = (to - world.at(name)).tolist()
     off = math.hypot(x, y)
     height = lift.over(off)
@@ -145,8 +160,12 @@ def carry(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) ->
 
 
 def let_go(world: World, name: str, height: float) -> Target:
-    """Open the fingers just enough to free an object, then rise straight to a height over its
-    centre [m].
+    """Open the fingers just enough to free an object, then rise straight up.
+
+    Args:
+        world: The world to look at.
+        name: The object's name.
+        height: The height of the hand over the object's centre to rise to [m].
     """
     g, ee = grasp_of(world, name), world.ee
     beyond = min(RELEASE, world.gripper.most - g.width)
@@ -160,8 +179,13 @@ def let_go(world: World, name: str, height: float) -> Target:
 
 
 def hand_is_at(world: World, name: str, aside: float, above: float) -> bool:
-    """Return whether the hand is at an object, at most `aside` beside it and `above` over it
-    [m].
+    """Return whether the hand is close to an object.
+
+    Args:
+        world: The world to look at.
+        name: The object's name.
+        aside: The upper bound on the hand's horizontal distance from the object's centre [m].
+        above: The upper bound on the hand's height over the object's centre [m].
     """
     x, y, z = (world.ee.position - world.at(name)).tolist()
     return math.hypot(x, y) < aside and z < above
@@ -170,9 +194,16 @@ def hand_is_at(world: World, name: str, aside: float, above: float) -> bool:
 def grasp_rungs(
     which: Which, hover: float = 0.0, approach: Callable[[World, str, float], Target] = approach
 ) -> tuple[Rung, ...]:
-    """Return the ladder that gets the fingers around an object and closes them.
+    """Return the rungs that bring the fingers around an object and close them.
 
-    hover: see `approach`.
+    Args:
+        which: Returns the name of the object to grasp.
+        hover: The height over the grasp on the way there, see `approach` [m].
+        approach: Returns the target of the approach, given the world, the object's name and
+            `hover`.
+
+    Returns:
+        The rungs `grasp`, `open`, `descend` and `approach`, in this order.
     """
 
     def near(world: World) -> bool:
@@ -210,9 +241,15 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
 
 
 def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> float:
-    """Return progress of getting the fingers around an object, 0 to 1, by distance.
+    """Return how far the fingers have come on their way around an object, 0 to 1.
 
-    Hover, rise: see `approach`.
+    It depends on the distance left on the path of `approach`.
+
+    Args:
+        world: The world to look at.
+        name: The object's name.
+        hover: The height over the grasp on the way there, see `approach` [m].
+        rise: The least height over the grasp [m].
     """
     g = grasp_of(world, name)
     above = float(world.ee.position[2]) - g.at[2]
@@ -221,8 +258,9 @@ def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.
 
 
 def pick_progress(world: World, name: str) -> float:
-    """Return progress of grasping an object and carrying it to the goal, 0 to 1, by the distance
-    left on that path.
+    """Return how far an object has come on its way to the grasp and the goal, 0 to 1.
+
+    It depends on the distance left on that path.
     """
     if is_held(world, name):
         return _GRASPED + (1 - _GRASPED) * carry_progress(world, name, world.goal)
@@ -230,10 +268,15 @@ def pick_progress(world: World, name: str) -> float:
 
 
 def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) -> float:
-    """Return progress of carrying a held object to a point (3,) [m], 0 to 1, by the distance left
-    on `carry`'s path.
+    """Return how far a held object has come on its way to a point, 0 to 1.
 
-    That path goes up, sideways, and down.
+    It depends on the distance left on the path of `carry`, which goes up, sideways, and down.
+
+    Args:
+        world: The world to look at.
+        name: The object's name.
+        to: The target of the object's centre, (3,) [m].
+        lift: The height of the object on its way there.
     """
     x, y, z = (to - world.at(name)).tolist()
     off = math.hypot(x, y)
@@ -242,8 +285,9 @@ def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = OVER_NO
 
 
 def nearness(rest: float) -> float:
-    """Return 1 if at most `AT_GOAL` [m] is left.
+    """Return 1 if at most `AT_GOAL` is left; it falls towards 0 as more is left.
 
-    It falls towards 0 as more is left. rest: distance left [m].
+    Args:
+        rest: The distance left [m].
     """
     return _HALFWAY / (_HALFWAY + max(0.0, rest - AT_GOAL))

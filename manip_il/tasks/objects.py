@@ -31,7 +31,15 @@ def add_cube(
     mass: float = CUBE_MASS,
     colour: tuple[float, ...] = RED,
 ) -> None:
-    """Add a free cube. half: half its edge [m]; mass [kg]; colour: red, green and blue."""
+    """Add a free cube.
+
+    Args:
+        spec: The scene to add it to.
+        name: The name of its body, joint, geom and material.
+        half: Half the length of its edges [m].
+        mass: Its mass [kg].
+        colour: Red, green and blue, 0 to 1.
+    """
     add_object(spec, name, "box", [half] * 3, mass, colour)
 
 
@@ -44,11 +52,16 @@ def add_object(
     colour: tuple[float, ...],
     mesh: Mesh | None = None,
 ) -> None:
-    """Add a free object. shape: key of `SHAPES`; size: MuJoCo's `geom_size` [m]; mass [kg].
+    """Add a free object.
 
-    colour: red, green, blue.
-
-    mesh: used in place of the size.
+    Args:
+        spec: The scene to add it to.
+        name: The name of its body, joint, geom and material.
+        shape: A key of `SHAPES`.
+        size: MuJoCo's `geom_size` for this shape, (1,) to (3,) [m].
+        mass: Its mass [kg].
+        colour: Red, green and blue, 0 to 1.
+        mesh: Its surface, which replaces `size`, if the shape is a mesh.
     """
     material = spec.add_material(name=name, rgba=[*colour, 1], specular=0.3, shininess=0.5)
     body = spec.worldbody.add_body(name=name, pos=[0.5, 0, max(size)])
@@ -77,9 +90,14 @@ def add_furniture(spec: mujoco.MjSpec, name: str) -> Any:
 def add_part(
     body: Any, name: str, half: Sequence[float], at: Sequence[float], colour: tuple[float, ...]
 ) -> None:
-    """Add a solid box to a body. half: half its lengths [m].
+    """Add a solid box to a body.
 
-    at: its middle in the body's frame [m].
+    Args:
+        body: The body to add it to.
+        name: The name of its geom.
+        half: Half its lengths, (3,) [m].
+        at: Its middle in the body's frame, (3,) [m].
+        colour: Red, green and blue, 0 to 1.
     """
     body.add_geom(
         name=name,
@@ -93,10 +111,13 @@ def add_part(
 
 
 def add_goal(spec: mujoco.MjSpec, *, flat: bool = False) -> None:
-    """Add a goal marker without contacts: a mocap body, so that lockstep environments can share one
-    model.
+    """Add a goal marker without contacts.
 
-    flat: a disc on the table, not a ball in the air.
+    It is a mocap body, so that lockstep environments can share one model.
+
+    Args:
+        spec: The scene to add it to.
+        flat: Whether the marker is a disc on the table and not a ball in the air.
     """
     material = spec.add_material(name=GOAL, rgba=list(_GREEN), specular=0.0, emission=0.4)
     body = spec.worldbody.add_body(name=GOAL, mocap=True, pos=[0.5, 0, 0.2])

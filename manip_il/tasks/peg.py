@@ -69,11 +69,15 @@ IN_AIR, BESIDE = 0.006, 0.045
 
 
 class Grip(NamedTuple):
-    """Grip that the hand aims for: pose of `ee`, position (3,) [m] and rotation (3, 3).
+    """Grip that the hand aims for, and how far the hand is from it.
 
-    off: misalignment of the hand, distance and angle as one length [m]; angle: between the
-    rotations of hand and grip [rad]; height: distance to keep above the grip, which grows with the
-    misalignment [m]. open_enough: whether the fingers pass on both sides of the peg.
+    Attributes:
+        position: The position of `ee`, (3,) [m].
+        rotation: The rotation of `ee`, (3, 3).
+        off: The misalignment of the hand, distance and angle as one length [m].
+        angle: The angle between the rotations of the hand and the grip [rad].
+        height: The distance to keep above the grip, which grows with the misalignment [m].
+        open_enough: Whether the fingers pass on both sides of the peg.
     """
 
     position: F64
@@ -85,8 +89,9 @@ class Grip(NamedTuple):
 
 
 def hand_at(yaw: float, pitch: float) -> F64:
-    """Return `ee`'s rotation (3, 3): the hand points down at `pitch` 0, and level, along `yaw`,
-    at pi/2 [rad].
+    """Return the rotation of `ee`, (3, 3), at a yaw and a pitch [rad].
+
+    The hand points down at a pitch of 0, and level along `yaw` at a pitch of pi/2.
     """
     c, s = math.cos(yaw), math.sin(yaw)
     level, upright = math.cos(pitch), math.sin(pitch)
@@ -131,8 +136,9 @@ def stands(world: World) -> bool:
 
 @once_per_state
 def holds_peg(world: World) -> bool:
-    """Return whether both fingers touch the peg, and the hand is within the peg's faces and ends
-    or just outside.
+    """Return whether the hand holds the peg.
+
+    Both fingers touch the peg, and the hand is within the peg's faces and ends or just outside.
     """
     if not world.touched(PEG):
         return False
@@ -183,10 +189,13 @@ def _farthest(scene: Scene) -> float:
 class Way(NamedTuple):
     """Remaining motion of a held peg.
 
-    rotation: the hand's once the peg is upright and, if it goes into the hole, aligned with the
-    hole, (3, 3); turn: remaining rotation vector, (3,) [rad]. off: remaining horizontal offset,
-    (2,) [m]. error: off and turn, as one length [m]. low: height of the peg's lower end over the
-    table once the peg is upright [m].
+    Attributes:
+        rotation: The hand's rotation once the peg is upright and, if it goes into the hole, aligned
+            with the hole, (3, 3).
+        turn: The remaining rotation vector of the hand, (3,) [rad].
+        off: The remaining horizontal offset, (2,) [m].
+        error: `off` and `turn` as one length [m].
+        low: The height of the peg's lower end over the table once the peg is upright [m].
     """
 
     rotation: F64
@@ -240,10 +249,13 @@ def _free_place(world: World, end: F64) -> F64:
 
 
 def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
-    """Return the remaining motion if the hand turns with the peg to a rotation (3, 3).
+    """Return the motion that is left if the hand turns with the peg to a rotation.
 
-    to: returns the target of the peg's lower end, given where the turn alone would bring it, (3,)
-    [m].
+    Args:
+        world: The world to look at.
+        rotation: The rotation of the hand once the peg is upright, (3, 3).
+        to: Returns the target of the peg's lower end, (3,) [m], given the world and where the turn
+            alone would bring this end, (3,) [m].
     """
     ee, peg = world.ee, world.pose(PEG)
     turn = rotation_vector(rotation @ ee.rotation.T)
@@ -272,10 +284,14 @@ def _set_up_height(world: World, way: Way) -> float:
 
 
 def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool = False) -> Target:
-    """Return the target that moves the peg with the hand.
+    """Return the target that moves the held peg with the hand.
 
-    missing: height to gain [m]; sideways_at: missing height below which it moves sideways [m];
-    exact: see `Target`.
+    Args:
+        world: The world to look at.
+        way: The motion that is left.
+        missing: The height that the peg's lower end must still gain, negative if it must sink [m].
+        sideways_at: The missing height below which the peg also moves sideways [m].
+        exact: Whether the hand must be placed exactly, see `Target`.
     """
     sideways = share(1.0 - missing / sideways_at)
     turn = TURN * min(1.0, max(0.25, 1.0 - missing / 0.06))
@@ -291,9 +307,7 @@ def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool
 
 
 def is_up(world: World) -> bool:
-    """Return whether the peg stands on the table, with an oblique hand around it or just above
-    it.
-    """
+    """Return whether the peg stands on the table, with an oblique hand at it or just above it."""
     x, y, z = (world.ee.position - lower_end(world)).tolist()
     up = float(upper_axis(world)[2]) > math.cos(0.15) and lower_end(world)[2] < ON_TABLE
     return up and is_aslant(world) and math.hypot(x, y) < 0.03 and z < world.extents(PEG)[2] + CLEAR

@@ -34,10 +34,12 @@ ANY_SHAPE = 200  # horizon: small or rolling objects take more attempts than a c
 
 @dataclass(frozen=True)
 class PickPlace(Task):
-    """Bring the object's centre to the goal. Ranges are those of gymnasium-robotics'
-    FetchPickAndPlace.
+    """Bring the object's centre to the goal.
 
-    shape: shape of the object, a 5 cm cube unless `--task.object=` says otherwise.
+    The ranges are those of gymnasium-robotics' FetchPickAndPlace.
+
+    Attributes:
+        shape: The object's shape, a 5 cm cube unless `--task.object=` says otherwise.
     """
 
     name: str = "pick_place"
@@ -65,16 +67,18 @@ class PickPlace(Task):
         add_goal(spec)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the object on the table, lying or standing at any yaw, and the goal, in the air
-        half of the time.
+        """Draw the object on the table, lying or standing at any yaw, and the goal.
+
+        The goal is in the air half of the time.
         """
         at, turn = draw_lying(rng, world, OBJECT)
         goal = draw_goal(rng, world, float(at[2]))
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Return hand, goal, the object as `observe_object` describes it, and the vectors
-        between them.
+        """Return the hand, the goal, the object, and the vectors between them.
+
+        The object is described by `observe_object`.
         """
         return {
             **observe_hand(world),
@@ -88,8 +92,9 @@ class PickPlace(Task):
         return math.dist(world.at(OBJECT).tolist(), world.goal.tolist())
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label (the mesh, as it lies, is too wide or too low for
-        the gripper), or "".
+        """Return why there is no sound label, or "" if there is one.
+
+        There is none if the mesh, as it lies, is too wide or too low for the gripper.
         """
         if lie_of(world, OBJECT).fits or is_held(world, OBJECT):
             return ""
@@ -109,8 +114,9 @@ class Lift(PickPlace):
     horizon: int = 150
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the object on the table, lying or standing at any yaw, and the height of the goal
-        over it.
+        """Draw the object on the table, and the height of the goal over it.
+
+        The object lies or stands at any yaw.
         """
         low, high = np.array(LIFT) * min(1.0, world.robot.workspace.height / LIFT_HEIGHT)
 
@@ -124,8 +130,9 @@ class Lift(PickPlace):
 
 
 def observe_object(world: World, name: str) -> Observed:
-    """Return an object's position, yaw modulo its symmetry, tilt and lengths, and the vector to
-    it from the hand.
+    """Return an object's pose and lengths, and the vector to it from the hand.
+
+    The pose is its position, its yaw modulo its symmetry, and its tilt.
     """
     position, lie = world.at(name), lie_of(world, name)
     if not world.scene.draws_shape and is_cube(world, name):

@@ -31,11 +31,13 @@ ROOM = 0.06  # reachable margin behind the puck at the start [m]
 
 
 class PushStyle(NamedTuple):
-    """Dimensions of a pushing hand. behind: how far behind the puck's middle it starts [m].
+    """Dimensions of a pushing hand.
 
-    opening: gap between the fingers, so that the puck rests against both [m]. touching: how far
-    behind the puck's middle it touches the puck [m]. lower: replaces `LOW_ENOUGH` at the distance
-    `behind` [m].
+    Attributes:
+        behind: How far behind the puck's middle it starts [m].
+        opening: The gap between the fingers, so that the puck rests against both [m].
+        touching: How far behind the puck's middle it touches the puck [m].
+        lower: The number that replaces `LOW_ENOUGH` at the distance `behind` [m].
     """
 
     behind: float
@@ -165,8 +167,9 @@ class Push(Task):
         add_goal(spec, flat=True)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the puck, and a goal away from it, placed so that the hand can reach behind the
-        puck.
+        """Draw the puck, and a goal away from it.
+
+        The hand can reach behind the puck.
         """
         at, height = draw_resting(rng, world, PUCK, ROOM + 0.02), resting_height(world, PUCK)
 

@@ -53,8 +53,9 @@ class ReachGoal(Task):
 
 
 def observe_hand(world: World) -> Observed:
-    """Return the hand's position and its y and z axes, the first entries of every
-    `environment_state`.
+    """Return the hand's position and its y and z axes.
+
+    They are the first entries of every `environment_state`.
     """
     ee = world.ee
     return {"ee": ee.position, "ee.axis_y": ee.rotation[:, 1], "ee.axis_z": ee.rotation[:, 2]}

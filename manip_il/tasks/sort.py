@@ -178,8 +178,9 @@ _LET_GO, _CARRY = drop_rungs(
 
 
 class Sort(Task):
-    """Put the cube that the instruction names into the bin of its colour, and leave the others
-    on the table.
+    """Put the cube that the instruction names into the bin of its colour.
+
+    The other cubes stay on the table.
     """
 
     name = "sort"
@@ -207,8 +208,9 @@ class Sort(Task):
         return (asked(world),)
 
     def unsound(self, world: World) -> str:
-        """Return "the bins do not stand in a row" if some bins were moved without the others,
-        else "".
+        """Return why there is no sound label, or "" if there is one.
+
+        There is none if some bins were moved without the others and do not stand in a row.
         """
         bins = np.array(sorted(world.at(one).tolist() for one in BINS.values()))
         row = bins[0] + np.outer(np.arange(len(bins)), [PITCH, 0.0, 0.0])
@@ -222,8 +224,9 @@ class Sort(Task):
         add_furniture(spec, ASKED).pos = [0, 0, 0]
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw which cube is named, the sentence, the bins' side and order, and the cubes, apart
-        and at any yaw.
+        """Draw which cube is named, the sentence, the bins' side and order, and the cubes.
+
+        The cubes are apart, at any yaw.
         """
         number, sentence = float(rng.integers(len(COLOURS))), float(rng.integers(len(SENTENCES)))
         poses: dict[str, tuple[F64, F64]] = {ASKED: (np.array([number, 0.0, sentence]), UPRIGHT)}
@@ -247,8 +250,9 @@ class Sort(Task):
         return Start(poses)
 
     def observe(self, world: World) -> Observed:
-        """Return hand, which cube is named, its pose and vectors to its bin, and all positions
-        of cubes and bins.
+        """Return the hand, which cube is named, its pose, and all positions of cubes and bins.
+
+        The vectors from the named cube to its bin and to its release point are returned as well.
         """
         name = asked(world)
         return {
@@ -265,16 +269,18 @@ class Sort(Task):
         }
 
     def error(self, world: World) -> float:
-        """Return the named cube's distance from its bin's middle [m], 0 inside, plus 0.1 m per
-        other cube in a bin.
+        """Return the named cube's distance from its bin's middle [m], 0 inside.
+
+        Each other cube in a bin adds 0.1 m.
         """
         name = asked(world)
         off = math.dist(world.at(name), world.at(BINS[name]))
         return (0.0 if _is_sorted(world, name) else off) + _WRONG * _wrong(world)
 
     def progress(self, world: World) -> float:
-        """Return progress of grasping the named cube and bringing it to its bin around the
-        others.
+        """Return progress of grasping the named cube and bringing it to its bin.
+
+        The path leads around the other cubes.
         """
         name = asked(world)
         if _is_sorted(world, name):

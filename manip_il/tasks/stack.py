@@ -125,8 +125,9 @@ class Stack(Task):
         }
 
     def error(self, world: World) -> float:
-        """Return the cube's distance from its place on the base [m], plus 0.05 m until it stands
-        without the hand.
+        """Return the cube's distance from its place on the base [m].
+
+        0.05 m are added until it stands without the hand.
         """
         off = math.dist(world.at(TOP), place_on_base(world))
         return off + (0.0 if stands(world) and _hand_is_away(world) else _HAND)

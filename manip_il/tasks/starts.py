@@ -30,12 +30,22 @@ _UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.
 
 
 def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, F64]:
-    """Draw a pose of an object at rest, its side, place and yaw: position (3,) [m] and quaternion
-    wxyz (4,).
+    """Draw a pose of an object at rest.
 
     Sides that look alike count once. A capsule lies on its side; a mesh rests as modelled or, if it
     cannot, on the side nearest to its modelled underside. A cube's yaw is within +-pi/4, as its
     faces are alike.
+
+    Args:
+        rng: The source of random numbers.
+        world: The world, for the arm's reach and the object's shape.
+        name: The object's name.
+
+    Returns:
+        The position (3,) [m] and the quaternion wxyz (4,) of the object.
+
+    Raises:
+        UsageError: If no place fits within the arm's reach.
     """
     lengths = world.extents(name)
     if (hull := world.hull(name)) is not None:
@@ -68,9 +78,17 @@ def _sides(kind: int, lengths: Sequence[float]) -> list[int]:
 
 
 def draw_resting(rng: np.random.Generator, world: World, name: str, room: float = 0.0) -> F64:
-    """Draw a resting place of an object's centre, (3,) [m], not under the hand.
+    """Draw a place where an object's centre is at rest, not under the hand, (3,) [m].
 
-    room: see `draw_resting_place`.
+    Args:
+        rng: The source of random numbers.
+        world: The world, for the arm's reach and the object's height.
+        name: The object's name.
+        room: The margin around the place that must also be within reach, see `draw_resting_place`
+            [m].
+
+    Raises:
+        UsageError: If no place fits within the arm's reach.
     """
     return draw_resting_place(rng, world, name, resting_height(world, name), room)
 
@@ -78,11 +96,18 @@ def draw_resting(rng: np.random.Generator, world: World, name: str, room: float 
 def draw_resting_place(
     rng: np.random.Generator, world: World, name: str, height: float, room: float = 0.0
 ) -> F64:
-    """Draw a place at a height over the table, (3,) [m], within reach and away from the hand's
-    start.
+    """Draw a place at a height over the table, away from the hand's start, (3,) [m].
 
-    room: margin around the place [m] that must also be within reach, so that a knocked object stays
-    within reach.
+    Args:
+        rng: The source of random numbers.
+        world: The world, for the arm's workspace and reach.
+        name: What the place is for, which an error names.
+        height: The height of the place over the table [m].
+        room: The margin around the place that must also be within reach, so that a knocked object
+            stays within reach [m].
+
+    Raises:
+        UsageError: If no place fits within the arm's reach.
     """
     space = world.robot.workspace
     centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
@@ -97,9 +122,16 @@ def draw_resting_place(
 
 
 def draw_goal(rng: np.random.Generator, world: World, height: float, in_air: float = IN_AIR) -> F64:
-    """Draw a goal at `height` over the table or, with probability `in_air`, anywhere above that.
+    """Draw a goal at a height over the table or in the air above, (3,) [m].
 
-    (3,) [m].
+    Args:
+        rng: The source of random numbers.
+        world: The world, for the arm's workspace and reach.
+        height: The least height of the goal over the table [m].
+        in_air: The probability that the goal is anywhere above that height, not just at it.
+
+    Raises:
+        UsageError: If no place fits within the arm's reach.
     """
     top = world.robot.workspace.height if rng.uniform() < in_air else 0.0
     return draw_until(
@@ -128,7 +160,17 @@ def product(first: F64, second: F64) -> F64:
 
 
 def draw_until[T](draw: Callable[[], T], fits: Callable[[T], bool], world: World, what: str) -> T:
-    """Return the first draw that fits. Raises `UsageError` after a thousand draws."""
+    """Return the first draw that fits.
+
+    Args:
+        draw: Draws a candidate.
+        fits: Returns whether a candidate fits.
+        world: The world, whose task and robot an error names.
+        what: What is drawn, which an error names.
+
+    Raises:
+        UsageError: If none of a thousand draws fits.
+    """
     for _ in range(_MOST_DRAWS):
         drawn = draw()
         if fits(drawn):
@@ -145,11 +187,21 @@ def draw_together(
     fits: Callable[[F64, Sequence[F64]], bool],
     world: World,
 ) -> list[F64]:
-    """For each name draw a place (3,) [m] that fits the earlier places.
+    """Draw a place for each name that fits the places drawn before it.
 
-    If none is found, draw all places again.
+    If no such place is found for a name, all places are drawn again.
 
-    Raises `UsageError` after a thousand attempts.
+    Args:
+        draw: Draws a place for a name, (3,) [m].
+        names: The names, in the order in which their places are drawn.
+        fits: Returns whether a place fits, given the earlier places.
+        world: The world, whose task and robot an error names.
+
+    Returns:
+        The places, (3,) [m] each, in the order of the names.
+
+    Raises:
+        UsageError: If none of a thousand attempts succeeds.
     """
 
     def draw_all() -> list[F64]:

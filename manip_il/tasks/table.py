@@ -54,12 +54,12 @@ def get_task(name: NameOrPath, shape: NameOrPath = "") -> Task:
     Args:
         name: A name or, as `option.typed` returns it, the `Path` of a Python file, or of a
             `carry:reward.json`.
-        shape: The object's, as `ObjectShape.parse` reads it; empty for the task's default.
+        shape: The object's shape, as `ObjectShape.parse` reads it; empty for the task's default.
 
     Raises:
-        UnknownName: if no task has this name.
-        UsageError: for a file without a task, or an argument or a shape that is invalid or that the
-            task does not take.
+        UnknownName: If no task has this name.
+        UsageError: If a file has no task, or an argument or a shape is invalid or not taken by the
+            task.
     """
     if isinstance(name, Path) and name.suffix == SUFFIX:
         task = _of_file(name.absolute())

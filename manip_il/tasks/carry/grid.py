@@ -1,11 +1,10 @@
-"""A grid over a layout's free space, its costs-to-go for a reward, and how to descend them from any
-position.
+"""A grid over a layout's free space, its costs-to-go for a reward, and how to descend them.
 
 The goal is one of the grid's nodes. Features are integrated along the grid's edges as along any
 path, so that inverse reinforcement learning can compare demonstrated paths with those on the grid.
 
-Paths to a goal on a graph whose edges have features: weights turn features into costs, Dijkstra
-finds cheap paths.
+The grid's edges form a graph whose edges have features. Weights turn these features into costs, and
+Dijkstra's algorithm finds the cheapest paths to the goal.
 
 Demonstrations are paths to the goal. Weights are inferred by comparing each demonstration with
 alternative paths.
@@ -36,11 +35,15 @@ _SAME = 1e-6  # largest difference between equal feature sums [m]
 
 @dataclass(frozen=True)
 class PathProblem:
-    """S nodes, E edges with K features each, one goal.
+    """A graph with S nodes, E edges with K features each, and one goal.
 
-    edges: nodes (from, to), (E, 2), each pair once, without self-loops. features: (E, K), 0 or
-    more; the first one is the edge's length [m], above 0; another may be the part of this length
-    that lies above an object on the table [m].
+    Attributes:
+        edges: The nodes (from, to) of each edge, (E, 2), each pair once, without self-loops.
+        features: The features of each edge, (E, K), 0 or more. The first one is the edge's length
+            [m], above 0; another may be the part of this length that lies above an object on the
+            table [m].
+        nodes: The number of nodes, S.
+        goal: The goal's node number.
     """
 
     edges: I64
@@ -72,7 +75,8 @@ class PathProblem:
     def sums(self, path: I64) -> F64:
         """Return the feature sums (K,) over the edges of a path of nodes (n,).
 
-        Raises `ManipError` without one.
+        Raises:
+            ManipError: If no edge joins two consecutive nodes.
         """
         edges = np.array([self.numbers[pair] for pair in pairwise(path.tolist())], np.int64) - 1
         if (edges < 0).any():
@@ -84,8 +88,10 @@ class PathProblem:
 class Plan:
     """The cheapest path to the goal from every node.
 
-    costs: (S,), infinite if no path leads to the goal. following: the next node, (S,), negative at
-    the goal and if there is no path.
+    Attributes:
+        costs: The cost of each node's path, (S,), infinite if no path leads to the goal.
+        following: The next node on each node's path, (S,), negative at the goal and if there is no
+            path.
     """
 
     costs: F64
@@ -98,8 +104,9 @@ def plan(problem: PathProblem, weights: F64) -> Plan:
 
 
 def plan_edges(problem: PathProblem, costs: F64) -> Plan:
-    """Return the cheapest path from every node for edge costs (E,), 0 or more: Dijkstra
-    backwards from the goal.
+    """Return the cheapest path from every node for edge costs (E,), 0 or more.
+
+    Dijkstra's algorithm runs backwards from the goal.
     """
     found, following = dijkstra(
         problem.matrix(costs).T.tocsr(), indices=problem.goal, return_predecessors=True
@@ -108,9 +115,18 @@ def plan_edges(problem: PathProblem, costs: F64) -> Plan:
 
 
 def cheapest_path(problem: PathProblem, planned: Plan, start: int) -> tuple[I64, F64]:
-    """Return the nodes (n,) and feature sums (K,) of a plan's path from node `start`.
+    """Return a plan's path from a node to the goal.
 
-    Raises `ManipError` if no path leads to the goal.
+    Args:
+        problem: The graph and its features.
+        planned: The plan for this problem.
+        start: The number of the node where the path begins.
+
+    Returns:
+        The path's nodes (n,), of which the last is the goal, and its feature sums (K,).
+
+    Raises:
+        ManipError: If no path leads from `start` to the goal.
     """
     if not np.isfinite(planned.costs[start]):
         raise ManipError(f"no path leads from node {start} to the goal")
@@ -140,8 +156,9 @@ class Demonstration:
 
 
 def stages(demonstrations: Sequence[Demonstration]) -> list[Sequence[Demonstration]]:
-    """Return the sets of demonstrations to fit in turn: every fifth one (skipped if these are
-    too few), then all.
+    """Return the sets of demonstrations to fit in turn.
+
+    The first set is every fifth one, and is skipped if these are too few; the last set is all.
     """
     few = demonstrations[::_EVERY]
     return [few, demonstrations] if len(few) >= _FEW else [demonstrations]
@@ -159,8 +176,16 @@ def rivals(demonstrations: Sequence[Demonstration], tastes: F64) -> list[F64]:
 def add_rivals(
     demonstrations: Sequence[Demonstration], sums: Sequence[F64], tastes: F64
 ) -> list[F64]:
-    """Return the `sums` of `rivals`, (m, K) each, with the alternatives for further weight
-    vectors `tastes` (n, K).
+    """Add the alternatives for further weight vectors to the result of `rivals`.
+
+    Args:
+        demonstrations: The demonstrated paths.
+        sums: The feature sums known so far, (m, K) for each demonstration.
+        tastes: The further weight vectors, (n, K).
+
+    Returns:
+        The distinct feature sums for each demonstration, at most (m + n, K), in which the known
+        ones come first.
     """
     found = []
     for one, known in zip(demonstrations, sums, strict=True):
@@ -174,10 +199,9 @@ def add_rivals(
 
 
 def open_features(demonstrations: Sequence[Demonstration], sums: Sequence[F64]) -> list[int]:
-    """Return the indices of the features in which no demonstration differs from its alternatives
-    `sums` (m, K).
+    """Return the indices of the features whose weights are not identified.
 
-    The weights of these features are not identified.
+    In these features no demonstration differs from its alternatives `sums` (m, K).
     """
     off = [
         np.abs(others - one.sums).max(axis=0)
@@ -246,8 +270,12 @@ def _numbers(index: I64, shape: tuple[int, ...]) -> I64:
 class Grid:
     """Nodes of a layout's free space, each joined to the 26 around it.
 
-    shape: node counts along x, y and z; origin: first node's place (3,) [m]; cell: spacing [m];
-    goal: its node number.
+    Attributes:
+        layout: What stands on the table, and the goal.
+        shape: The node counts along x, y and z.
+        origin: The first node's place, (3,) [m].
+        cell: The spacing of the nodes [m].
+        goal: The goal's node number.
     """
 
     def __init__(self, layout: Layout, robot: Robot):
@@ -275,8 +303,9 @@ class Grid:
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
-        """Whether an object may be at each node, (S,): within reach, clear of obstacles, and
-        lifted.
+        """Whether an object may be at each node, (S,).
+
+        It must be within reach, clear of obstacles, and lifted unless it is near the goal.
         """
         layout, points = self.layout, self.points
         off = np.hypot(*(points[:, :2] - np.array(layout.goal[:2])).T)
@@ -304,15 +333,18 @@ class Grid:
 
     @cached_property
     def problem(self) -> PathProblem:
-        """The grid's edges, with features integrated along each, as a problem for inverse
-        reinforcement learning.
+        """The grid as a problem for inverse reinforcement learning.
+
+        Features are integrated along each edge.
         """
         features = self._integrals(self.layout.densities(self._fine))
         return PathProblem(self._links.edges, features, len(self.points), self.goal)
 
     def costs_to_go(self, weights: F64) -> F64:
-        """Return the cost of the cheapest path to the goal from every node, (S,), for weights
-        (K,).
+        """Return the cost of the cheapest path from each node to the goal, (S,).
+
+        Args:
+            weights: The cost per metre of each feature, (K,).
         """
         costs = self._integrals(self.layout.densities(self._fine) @ weights)
         return self._plan(costs, self.goal)[1].costs
@@ -331,12 +363,11 @@ class Grid:
         return nodes[np.linalg.norm(self.points[nodes] - position, axis=1) < AHEAD * self.cell]
 
     def snap(self, positions: F64) -> I64:
-        """Return a path of free nodes, (n,), each joined to the next, that follows positions (T, 3)
-        [m].
+        """Return a path of free nodes, (n,), that follows positions (T, 3) [m].
 
-        If the positions lie on a straight line, the path is no longer than the shortest path in the
-        grid. Gaps without free nodes are bridged by the shortest path. If the positions end near
-        the goal, the path is extended to it.
+        Each node is joined to the next. If the positions lie on a straight line, the path is no
+        longer than the shortest path in the grid. Gaps without free nodes are bridged by the
+        shortest path. If the positions end near the goal, the path is extended to it.
         """
         dense = _dense(positions, self.cell / 4)
         index = (
@@ -383,7 +414,10 @@ def _dense(positions: F64, step: float) -> F64:
 class Descent:
     """Costs-to-go of a grid, and how to descend them from any position.
 
-    costs: each node's cost-to-go, (S,); weights: each feature's cost per metre, (K,).
+    Attributes:
+        grid: The grid of the layout.
+        costs: The cost-to-go of each node, (S,).
+        weights: The cost per metre of each feature, (K,).
     """
 
     grid: Grid
@@ -411,11 +445,11 @@ class Descent:
         )
 
     def look(self, position: F64) -> tuple[float, F64 | None]:
-        """Return the cost-to-go at a position (3,) [m], and a point to head for, about `AHEAD`
-        cells away, (3,) [m].
+        """Return the cost-to-go at a position (3,) [m], and a point to head for.
 
-        The cost is that of the cheapest way: a straight line to a node, and the path from there. It
-        is infinite, and the point None, if no free line leads to a node with a path.
+        The cost is that of the cheapest way, a straight line to a node and the path from there. The
+        point (3,) [m] is about `AHEAD` cells away. The cost is infinite, and the point None, if no
+        free line leads to a node with a path.
         """
         nodes = self._around(position)
         ends = self.grid.points[nodes]
@@ -456,9 +490,12 @@ class Descent:
 
 @lru_cache(KEPT)
 def descent(layout: Layout, reward: Reward, robot: Robot) -> Descent:
-    """Return a layout's costs-to-go for a reward, as a `Descent` to the goal.
+    """Return a layout's costs-to-go for a reward, which are cached once computed.
 
-    Computed once and cached.
+    Args:
+        layout: What stands on the table, and the goal.
+        reward: What a metre of path costs.
+        robot: The arm, whose reach bounds the grid.
     """
     grid, weights = Grid(layout, robot), np.array(reward.weights)
     return Descent(grid, grid.costs_to_go(weights), weights)

@@ -1,6 +1,6 @@
-"""Layouts of `carry`: what stands on the table, as pure geometry.
+"""Layouts and rewards of `carry`, as pure geometry.
 
-Rewards: what a metre of path costs there.
+A layout is what stands on the table, and a reward is what a metre of path costs there.
 
 Paths are those of the carried object's centre. Features are densities per metre of path, functions
 of a point alone; for a path of points, or an edge of the grid, they are integrated along it. A
@@ -39,8 +39,11 @@ MOST = 1e6  # largest weight
 
 
 class Obstacle(NamedTuple):
-    """Half lengths along x and y, and height of an obstacle [m], for an arm whose workspace is
-    30 cm wide.
+    """Size of an obstacle for an arm whose workspace is 30 cm wide.
+
+    Attributes:
+        half: Half its lengths along x and y, (2,) [m].
+        height: Its height [m].
     """
 
     half: tuple[float, float]
@@ -63,15 +66,23 @@ STEP = 0.005  # half the spacing of the points at which a line's room is checked
 
 
 class Edge(NamedTuple):
-    """Edge of the table: a point on it (x, y) [m], and the unit vector away from the table."""
+    """Edge of the table.
+
+    Attributes:
+        at: A point on it, (x, y) [m].
+        outwards: The unit vector away from the table, (2,).
+    """
 
     at: tuple[float, ...]
     outwards: tuple[float, ...]
 
 
 class Part(NamedTuple):
-    """Part of object or hand: height of its lowest point, and its radius, both from the object's
-    centre [m].
+    """Part of the object or the hand, relative to the object's centre.
+
+    Attributes:
+        bottom: The height of its lowest point [m].
+        radius: Its radius about the vertical [m].
     """
 
     bottom: float
@@ -82,10 +93,13 @@ class Part(NamedTuple):
 class Layout:
     """What stands on the table in one episode.
 
-    scale: factor on all lengths, 1 for a workspace of half width `FULL`. goal: target of the
-    object's centre [m]. places: (x, y) [m] of the obstacles present, by name. edge: the table's;
-    None if it is not near. half: half the object's height [m]. parts: of object and hand, relative
-    to the object's centre.
+    Attributes:
+        scale: The factor on all lengths, 1 for a workspace of half width `FULL`.
+        goal: The target of the object's centre, (3,) [m].
+        places: The (x, y) [m] of the obstacles that are present, by name.
+        edge: The table's edge; None if it is not near.
+        half: Half the object's longest length [m].
+        parts: The parts of the object and the hand, relative to the object's centre.
     """
 
     scale: float
@@ -146,8 +160,14 @@ class Layout:
         return found
 
     def is_free(self, start: F64, end: F64, spare: float) -> bool:
-        """Return whether `room` is at least `spare` [m] all along the straight line from `start`
-        to `end`, (3,) [m].
+        """Return whether an object may be carried along a straight line.
+
+        The clearance is checked at points that are at most 2 `STEP` apart.
+
+        Args:
+            start: The line's first point, (3,) [m].
+            end: The line's last point, (3,) [m].
+            spare: The least `room` that is required along the line [m].
         """
         pieces = max(1, math.ceil(np.linalg.norm(end - start) / (2 * STEP)))
         return bool(
@@ -167,11 +187,14 @@ def _bump(off: F64, width: float) -> F64:
 
 @dataclass(frozen=True)
 class Reward:
-    """Weights, in the order of `FEATURES`: each is the cost of a metre of path on which its feature
-    is 1.
+    """Weights of the features, each the cost of a metre of path on which its feature is 1.
 
-    Raises `UsageError` for a weight outside 0 to `MOST`, and for a weight of 0 for `length`: paths
-    could then have any length.
+    Attributes:
+        weights: The weights, (K,), in the order of `FEATURES`.
+
+    Raises:
+        UsageError: If a weight is outside 0 to `MOST`, or that of `length` is 0, as paths could
+            then have any length.
     """
 
     weights: tuple[float, ...]
@@ -190,7 +213,9 @@ class Reward:
     def of(cls, weights: Mapping[str, float]) -> Reward:
         """Return a reward from weights by feature, 0 by default.
 
-        Raises `UnknownName` for an unknown feature.
+        Raises:
+            UnknownName: If a feature is unknown.
+            UsageError: If a weight is invalid, see `Reward`.
         """
         if unknown := [name for name in weights if name not in FEATURES]:
             raise UnknownName("feature", unknown[0], FEATURES)
@@ -198,10 +223,15 @@ class Reward:
 
     @classmethod
     def parse(cls, text: NameOrPath) -> Reward:
-        """Return the reward that a text describes: the name of a shipped one, or `NAME=NUMBER,...`.
+        """Return the reward that a text or a file describes.
 
-        A `Path` is a `reward.json`, whose lists `names` and `weights` are read. Raises `UsageError`
-        for anything else.
+        Args:
+            text: The name of a shipped reward, or `NAME=NUMBER,...`; or the `Path` of a
+                `reward.json`, whose lists `names` and `weights` are read.
+
+        Raises:
+            UnknownName: If a feature is unknown.
+            UsageError: If the text or the file cannot be read, or a weight is invalid.
         """
         if (shipped := TASTES.get(str(text))) is not None:
             return shipped

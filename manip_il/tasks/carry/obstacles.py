@@ -54,8 +54,9 @@ _LOOKS = {  # visual geoms: kind, half size and middle in shares of the obstacle
 
 
 def add_obstacles(spec: mujoco.MjSpec, scale: float) -> None:
-    """Add the obstacles, their contact boxes, the table's edge, and bodies whose positions are
-    the reward's weights.
+    """Add the obstacles and the table's edge, with all that they need.
+
+    The obstacles have contact boxes. The positions of further bodies hold the reward's weights.
     """
     for name, obstacle in OBSTACLES.items():
         body = add_furniture(spec, name)
@@ -128,10 +129,15 @@ def make_layout(
     places: Mapping[str, F64],
     edge: tuple[F64, F64] | None,
 ) -> Layout:
-    """Return the layout for an object of lengths (3,) [m], a goal (3,) [m], places of obstacles
-    (3,) [m], and an edge.
+    """Return the layout for an object, its goal, and what stands on the table.
 
-    edge: a point on it (3,) [m] and the direction away from the table, (3,).
+    Args:
+        scene: The scene, whose robot gives the obstacles' scale and the parts of the hand.
+        lengths: The object's lengths along its axes, (3,) [m].
+        goal: The target of the object's centre, (3,) [m].
+        places: The positions of the obstacles that are present, (3,) [m] each, by name.
+        edge: A point on the table's edge, (3,) [m], and the direction away from the table, (3,);
+            None if the edge is not near.
     """
     _, middle, longest = sorted(lengths)
     own = Part(-longest / 2, math.hypot(middle, longest) / 2)
@@ -148,9 +154,12 @@ def make_layout(
 
 
 def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layout:
-    """Return the layout that an observation describes. name: the object's.
+    """Return the layout that an observation describes.
 
-    seen: `environment_state` by name.
+    Args:
+        scene: The scene that was observed.
+        name: The name of the object that is carried.
+        seen: The numbers of `environment_state`, by name.
     """
 
     def vector(of: str) -> F64:
@@ -164,8 +173,9 @@ def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layou
 
 
 def observe_obstacles(world: World) -> dict[str, F64 | float]:
-    """Return all obstacles' positions [m] and presence, and the table's edge: a point on it, its
-    outward axis.
+    """Return the position [m] and presence of every obstacle and of the table's edge.
+
+    The edge's position is a point on it; its outward axis is returned as well.
     """
     found: dict[str, F64 | float] = {}
     for name in (*OBSTACLES, EDGE):
@@ -176,8 +186,10 @@ def observe_obstacles(world: World) -> dict[str, F64 | float]:
 class Box(NamedTuple):
     """Upright box around a part of the hand, relative to `ee`.
 
-    bottom: height of its lowest point [m]. middle, half: centre and half-lengths along the hand's x
-    and y, (2,) [m].
+    Attributes:
+        bottom: The height of its lowest point [m].
+        middle: Its centre along the hand's x and y, (2,) [m].
+        half: Half its lengths along the hand's x and y, (2,) [m].
     """
 
     bottom: float
@@ -186,11 +198,12 @@ class Box(NamedTuple):
 
 
 class HandShape(NamedTuple):
-    """The open, downward hand. parts: lowest points and radii about the vertical through `ee`.
+    """The open hand that points down.
 
-    boxes: one per geom.
-
-    home: position of `ee` in the arm's home pose, (3,) [m].
+    Attributes:
+        parts: The lowest points and radii of its parts about the vertical through `ee`.
+        boxes: A box around each geom.
+        home: The position of `ee` in the arm's home pose, (3,) [m].
     """
 
     parts: tuple[Part, ...]
@@ -238,8 +251,13 @@ def _box(points: F64, axes: F64) -> Box:
 
 
 def fits(hand: HandShape, at: Sequence[float], yaw: float, layout: Layout) -> bool:
-    """Return whether a downward hand, `ee` at a place (3,) [m] and a yaw [rad], is clear of a
-    layout's obstacles.
+    """Return whether a downward hand is clear of all obstacles.
+
+    Args:
+        hand: The shape of the hand.
+        at: The position of `ee`, (3,) [m].
+        yaw: The yaw of the hand [rad].
+        layout: The layout, of which only the obstacles count.
     """
     # the hand's x and y
     axes = np.array([[math.cos(yaw), math.sin(yaw)], [math.sin(yaw), -math.cos(yaw)]])

@@ -127,10 +127,12 @@ def _approach(world: World, name: str, hover: float) -> Target:
 
 @dataclass(frozen=True)
 class Carry(PickPlace):
-    """Carry the object's centre to the goal past the obstacles on the table, as cheaply as possible
-    for a reward.
+    """Carry an object past obstacles to the goal, as cheaply as possible for a reward.
 
-    reward: written into the state at every start; the expert reads it from there.
+    Attributes:
+        reward: What a metre of path costs. It is written into the state at every start, and the
+            expert reads it from there.
+        scale: The scale of the obstacles, see `Layout`.
     """
 
     name: str = NAME
@@ -193,14 +195,16 @@ class Carry(PickPlace):
         )
 
     def observe(self, world: World) -> Observed:
-        """Return what `pick_place` observes, and every obstacle's position and presence, but not
-        the reward.
+        """Return what `pick_place` observes, and all obstacles, but not the reward.
+
+        Of each obstacle it returns the position, and whether it is present.
         """
         return {**super().observe(world), **observe_obstacles(world)}
 
     def unsound(self, world: World) -> str:
-        """Return why there is no sound label (obstacles overlap, no room for the hand, no path
-        to the goal), or "".
+        """Return why there is no sound label, or "" if there is one.
+
+        There is none if obstacles overlap, the hand has no room, or no path leads to the goal.
         """
         layout, at = layout_of(world, OBJECT), world.at(OBJECT)
         if layout.meeting:
@@ -216,8 +220,9 @@ class Carry(PickPlace):
         return "" if leads else "no free path to the goal"
 
     def progress(self, world: World) -> float:
-        """Return progress by distance to the grasp, then by cost-to-go divided by the cost of a
-        metre at the goal.
+        """Return progress by the distance to the grasp, then by the cost-to-go.
+
+        The cost-to-go is divided by the cost of a metre at the goal.
         """
         if not is_held(world, OBJECT):
             return 0.9 * _GRASPED * grasp_progress(world, OBJECT, rise=_rise(world))
