@@ -79,7 +79,13 @@ class Hand:
 
 @dataclass(frozen=True)
 class Thing:
-    """One object: its middle (3,) [m], its axes (3, 3), and how it is held."""
+    """One object in one state.
+
+    Attributes:
+        position: Middle of the object, (3,) [m].
+        axes: Its axes, (3, 3).
+        about: How it is held.
+    """
 
     position: F64
     axes: F64
@@ -304,12 +310,11 @@ def close_on(scene: AlohaScene, name: str, rotation: F64, longest: float = FAST)
 def approach(
     scene: AlohaScene, side: str, name: str, rotation: F64, back: float = 0.0, longest: float = FAST
 ) -> HandTarget:
-    """Return the target that approaches an object with open fingers, in a funnel along the grasp's
-    axis.
+    """Return the target that approaches an object with open fingers, in a funnel.
 
-    The hand keeps a distance of `SLOPE` (e - `TOLERANCE`) from the object, between `back` and
-    `STANDOFF`, where the error e is its sideways offset plus `ARM` times its angle to the grasp.
-    While its fingers are not open, it keeps up to `OPENING_STANDOFF`.
+    The hand moves along the grasp's axis. It keeps a distance of `SLOPE` (e - `TOLERANCE`) from the
+    object, between `back` and `STANDOFF`, where the error e is its sideways offset plus `ARM` times
+    its angle to the grasp. Until its fingers are open, it also stays up to `OPENING_STANDOFF` away.
 
     Args:
         scene: The state.
@@ -361,7 +366,7 @@ def move_object(
         side: The hand that holds the object, `left` or `right`.
         name: The object.
         to: The place, (3,) [m].
-        frame: What the object's `Thing.frame` is to become, (3, 3).
+        frame: The rotation that the object's `Thing.frame` is to have, (3, 3).
         longest: Longest step of a joint [rad].
     """
     hand, thing = scene.hands[side], scene.things[name]

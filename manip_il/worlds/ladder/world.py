@@ -389,8 +389,7 @@ class LadderKind(WorldKind):
 
     @override
     def affecting(self, config: EnvConfig, condition: Condition, *, sees: bool) -> Condition | None:
-        """Return the part of a condition that has an effect on the task's objects and the policy's
-        pictures.
+        """Return the part of a condition that changes something for this task and policy.
 
         Args:
             config: Settings of the environment.
