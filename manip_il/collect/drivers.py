@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 class Setting:
     """What a driver or query rule knows about its rollouts.
 
-    actions: the robot's action space. horizon: control steps per episode. policies: the driver's
-    loaded policies.
+    Attributes:
+        actions: The robot's action space.
+        horizon: Control steps per episode.
+        policies: The driver's loaded policies.
     """
 
     actions: ActionSpace
@@ -41,7 +43,10 @@ class Setting:
 class Driver:
     """Base class of drivers. They must be picklable.
 
-    beta: share of the steps that the expert drives. policies: the first one drives.
+    Attributes:
+        kind: The driver's name in datasets, unless it mixes policy and expert.
+        beta: Share of the steps that the expert drives.
+        policies: Checkpoints of the driver's policies, the first of which drives.
     """
 
     kind: ClassVar[str]
@@ -72,8 +77,10 @@ class ExpertDriver(Driver):
 
 @dataclass(frozen=True)
 class NoisyExpertDriver(Driver):
-    """Executes the expert's label plus Gaussian noise: DART (Laskey et al. 2017). covariance:
-    the noise's, (n, n).
+    """Executes the expert's label plus Gaussian noise, as in DART (Laskey et al. 2017).
+
+    Attributes:
+        covariance: Covariance of the noise, (n, n).
     """
 
     covariance: tuple[tuple[float, ...], ...]
@@ -109,12 +116,15 @@ class RandomDriver(Driver):
 
 @dataclass(frozen=True)
 class PolicyDriver(Driver):
-    """Executes the policy's action, or with probability beta the expert's: pi_i = beta pi* + (1 -
-    beta) pi_hat.
+    """Executes the policy's action or, with probability beta, the expert's.
 
-    policies: the first one drives; a query rule may compare the others with it. trust: whether to
-    load models and code that the checkpoints name. device: torch device of the policies. (Ross et
-    al. 2011)
+    This is the mixture pi_i = beta pi* + (1 - beta) pi_hat (Ross et al. 2011).
+
+    Attributes:
+        policies: The first one drives; a query rule may compare the others with it.
+        beta: Probability at each step that the expert's action is executed.
+        trust: Whether to load models and code that the checkpoints name.
+        device: Torch device of the policies.
     """
 
     kind = "policy"

@@ -52,12 +52,18 @@ _TRIES = 5  # scenes drawn for a state before the visited scene itself is used
 
 @dataclass(frozen=True)
 class Scenes:
-    """How scenes are drawn from a dataset's states. cameras: None for scenes without pictures.
+    """How scenes are drawn from a dataset's states.
 
-    anew: whether to also randomise goals and objects, not only appearance. conditions: ranges of
-    the appearance and of the observations' noise. branch_steps: control steps that the expert
-    drives from every state, for policies that predict chunks. first: number of the first scene in
-    the random stream, so that datasets redrawn with the same seed can differ.
+    Attributes:
+        cameras: Cameras that render the scenes; None for scenes without pictures.
+        frames: Number of scenes to draw.
+        seed: Seed of the random stream.
+        anew: Whether to also randomise goals and objects, and not only the appearance.
+        conditions: Ranges of the appearance and of the observations' noise.
+        branch_steps: Control steps that the expert drives from every state, for policies that
+            predict chunks.
+        first: Number of the first scene in the random stream, so that datasets redrawn with the
+            same seed can differ.
     """
 
     cameras: CameraConfig | None
@@ -77,11 +83,15 @@ class Scenes:
         return stream_seeds("redraw", self.first + self.frames, self.seed)[self.first :]
 
     def chunks(self, states: F64, leads: F64) -> Iterator[tuple[int, F64, F64]]:
-        """Yield, for every `CHUNK` scenes, the number of the first scene, the visited states and
-        their label offsets.
+        """Yield the visited states from which scenes are drawn, in pieces of `CHUNK` scenes.
 
-        states: rows of `sim_state` (S, m), used in an order drawn from the seed, repeatedly if
-        scenes outnumber them. leads: offset added to the label of each state's scene, (S, n).
+        Args:
+            states: Rows of `sim_state`, (S, m). They are used in an order drawn from the seed, and
+                repeatedly if there are more scenes than states.
+            leads: Offset added to the label of each state's scene, (S, n).
+
+        Yields:
+            The number of the first scene, the visited states (C, m), and the offsets (C, n).
         """
         order = rng_for(self.seed, "order of redrawn states").permutation(len(states))
         for at in range(0, self.frames, CHUNK):
@@ -90,7 +100,12 @@ class Scenes:
 
 
 class SceneDrawer:
-    """Draws, labels and renders scenes of one environment."""
+    """Draws, labels and renders scenes of one environment.
+
+    Args:
+        config: The environment.
+        scenes: How the scenes are drawn.
+    """
 
     def __init__(self, config: EnvConfig, scenes: Scenes):
         noise = [one.only("sensing") for one in scenes.conditions]
@@ -102,13 +117,19 @@ class SceneDrawer:
     def frames(
         self, visited: State, number: int, seed: int, lead: F64 | float = 0.0
     ) -> list[Transition]:
-        """Return the frames of a new scene: one labelled frame, or the frames of a branch.
+        """Draw a new scene from a visited state, and return its labelled frames.
 
-        [] without a valid label.
+        If none of the drawn scenes has a valid label, or without `Scenes.anew`, the visited scene
+        itself is labelled, in the drawn appearance.
 
-        visited: the state that is changed into the scene. number: scene number in the random
-        stream. seed: value of the `seed` column. lead: offset added to the label of a single frame,
-        (n,).
+        Args:
+            visited: The state that is changed into the scene.
+            number: Number of the scene in the random stream.
+            seed: Value of the `seed` column.
+            lead: Offset added to the label if the scene has a single frame, (n,).
+
+        Returns:
+            One labelled frame, or the frames of a branch; [] if there is no valid label.
         """
         rng = rng_for(number, "redraw")
         if self._has_noise:
@@ -158,7 +179,10 @@ NOTICEABLE = 0.01
 class EditSource:
     """A dataset whose states can be restored, and their environment.
 
-    warnings: reasons why the restored world may differ from the recorded one.
+    Attributes:
+        dataset: The dataset.
+        env: Settings of its environment.
+        warnings: Reasons why the restored world may differ from the recorded one.
     """
 
     dataset: Dataset
@@ -166,8 +190,10 @@ class EditSource:
     warnings: tuple[str, ...] = ()
 
     def check_has_no_sag(self, what: str) -> None:
-        """Raise `ManipError` if the labels hold the sag of `serve`'s servos. what: an edit that
-        would drop it.
+        """Raise `ManipError` if the labels hold the sag of `serve`'s servos.
+
+        Args:
+            what: The edit that would drop the sag, for the message.
         """
         if _is_served(self.dataset.provenance):
             raise ManipError(
@@ -184,10 +210,23 @@ def open_source(
 ) -> EditSource:
     """Open a dataset whose states are to be restored.
 
-    robot, task, shape: as in `EnvConfig`, for a robot, a task or a mesh of the user's own. Raises
-    `ManipError` if the folder is not a dataset of ours, `MismatchError` if it is for another robot,
-    task or object, and what `stored_config` raises for a robot, task or object that is not built
-    in.
+    Args:
+        root: The dataset's folder.
+        robot: The robot as in `EnvConfig`, if it is the user's own; by default the one that the
+            dataset names.
+        task: The same for the task.
+        shape: The same for the object, if it is a mesh of the user's own.
+
+    Returns:
+        The dataset and its environment, with warnings if the compiled model or MuJoCo's version
+        differs.
+
+    Raises:
+        ManipError: if the folder is not a dataset of ours.
+        MismatchError: if the dataset is for another robot, task or object, or its states have
+            another size.
+        UsageError: as in `stored_config`, for a robot, a task or an object that is not built in.
+        Unable: if the environment's states cannot be restored.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec
@@ -214,7 +253,11 @@ def open_source(
 class EditTarget:
     """The new dataset's folder, and how it is written.
 
-    replace: as in `new_folder`. on_piece: called after each episode, or each `CHUNK` of scenes.
+    Attributes:
+        root: The new folder.
+        workers: Number of processes; with 1 this process does the work.
+        replace: Whether to replace a dataset of ours at `root`.
+        on_piece: Called after each episode, or each `CHUNK` of scenes.
     """
 
     root: Path
@@ -224,13 +267,22 @@ class EditTarget:
 
 
 def relabel_dataset(source: EditSource, target: EditTarget) -> int:
-    """Write `source` with the expert's label of every state.
+    """Write `source` with the current expert's label of every state.
 
-    All other columns and pictures stay the same.
+    States in which the expert was not queried get a label, too. All other columns and the pictures
+    stay the same.
 
-    States in which the expert was not queried get a label, too. Returns the number of frames whose
-    label changed: its action by more than `NOTICEABLE`, its phase, or its validity. Raises what
-    `Dataset.stored_episodes` and `write_episodes` raise, and `ManipError` if a worker dies.
+    Args:
+        source: The dataset to relabel.
+        target: The new dataset's folder, and how it is written.
+
+    Returns:
+        The number of frames whose label changed: its action by more than `NOTICEABLE`, its phase,
+        or its validity.
+
+    Raises:
+        ManipError: if the labels hold the sag of `serve`'s servos, or if a worker dies; also what
+            `Dataset.stored_episodes` and `write_episodes` raise.
     """
     source.check_has_no_sag("data relabel")
     scale, dataset = described_env(source.env).actions.scale, source.dataset
@@ -249,8 +301,19 @@ def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget
 
     All other columns stay the same.
 
-    Raises `RenderError` if there is no OpenGL, and what `Dataset.stored_episodes` and
-    `write_episodes` raise.
+    Args:
+        source: The dataset to render.
+        cameras: Cameras, and the size and look of their pictures.
+        target: The new dataset's folder, and how it is written.
+
+    Returns:
+        The new dataset's `info.json`.
+
+    Raises:
+        RenderError: if there is no OpenGL.
+        Unable: if the environment cannot be drawn.
+        UnknownName: for a camera that the environment does not have.
+        ManipError: as in `Dataset.stored_episodes` and `write_episodes`.
     """
     dataset, here = source.dataset, env_spec(source.env, cameras)
     spec = replace(
@@ -272,10 +335,21 @@ def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget
 def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> Info:
     """Write a dataset of new scenes made from the states of `source`.
 
-    Each frame or branch is an episode.
+    Each frame or branch is an episode. The same seed gives the same scenes, and a larger number of
+    frames only adds scenes at the end.
 
-    The same seed gives the same scenes; a larger number of frames only adds scenes at the end.
-    Raises `NothingToLearnError` if no scene has a valid label.
+    Args:
+        source: The dataset whose states are changed into scenes.
+        scenes: How the scenes are drawn.
+        target: The new dataset's folder, and how it is written.
+
+    Returns:
+        The new dataset's `info.json`.
+
+    Raises:
+        NothingToLearnError: if no scene has a valid label.
+        ManipError: if branches are asked for, but the labels hold the sag of `serve`'s servos.
+        Unable: if the environment cannot be redrawn, varied or drawn as `scenes` asks.
     """
     if scenes.branch_steps > 1:
         source.check_has_no_sag("--branch_steps")
@@ -379,11 +453,20 @@ def _labels(env: EnvConfig, states: NDArray[Any]) -> list[Label]:
 
 
 def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -> Columns:
-    """Render states, rows of `sim_state` (T, m), to columns: pictures (T, height, width, 3),
-    keypoints (T, 3 K).
+    """Render the pictures and keypoints of states.
 
-    The values are bit-equal to what an environment with these cameras observes. Raises
-    `RenderError` without OpenGL.
+    The values are bit-equal to what an environment with these cameras observes.
+
+    Args:
+        env: The environment of the states.
+        cameras: Cameras, and the size and look of their pictures.
+        states: Rows of `sim_state`, (T, m).
+
+    Returns:
+        Columns of a dataset: pictures (T, height, width, 3), and keypoints (T, 3 K).
+
+    Raises:
+        RenderError: if there is no OpenGL.
     """
     view = make_env(env, cameras)
     spec = env_spec(env, cameras)

@@ -92,10 +92,17 @@ def differences(dataset: Dataset) -> list[str]:
 
 
 def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False) -> None:
-    """Warn if a policy's task or model differs from `env`.
+    """Check that a policy can drive an environment, and warn if its task or model differs.
 
-    Raises `MismatchError` unless the policy can drive `env`, `ManipError` if loading it needs
-    `trust`.
+    Args:
+        checkpoint: The policy.
+        env: The environment that it is to drive.
+        trust: Whether the policy may load models or code by name.
+
+    Raises:
+        MismatchError: if the policy cannot drive `env`.
+        ManipError: if loading the policy needs `trust`.
+        Unable: if the policy needs pictures, and `env` cannot be drawn.
     """
     path = str(checkpoint.path)
     origin, cameras = checkpoint.origin, checkpoint.cameras

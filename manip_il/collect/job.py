@@ -35,11 +35,21 @@ OWN_MODELS = 8  # lockstep limit if each environment has its own model (26 MB fo
 class RolloutJob:
     """Driver and environment of rollouts, their length, and what is recorded.
 
-    hold: end an episode this many steps after success; None: at the horizon. patience: end it after
-    this many steps without progress. label: what the expert returns in the states that `query`
-    selects. branch_steps: steps per branch. conditions: randomisations of the world, taken in turn
-    by seed. batch: largest number of episodes that share a policy call; does not change outcomes.
-    cameras: recorded in every step; None for none. A policy always gets the pictures that it needs.
+    Attributes:
+        env: Settings of the environment.
+        driver: Chooses the actions.
+        hold: Control steps after success at which an episode ends; None: it ends at the horizon.
+        patience: Control steps without progress after which an episode also ends; None: it never
+            does so.
+        label: What the expert returns in the states that `query` selects.
+        query: When the expert is queried.
+        branch_steps: Control steps per branch.
+        conditions: Randomisations of the world, taken in turn by seed.
+        batch: Largest number of episodes that share a call of the policy; it does not change
+            outcomes.
+        round: Number of the round, as stored in datasets.
+        cameras: Cameras recorded in every step; None for none. A policy always gets the pictures
+            that it needs.
     """
 
     env: EnvConfig
@@ -125,8 +135,19 @@ class RolloutJob:
 def run_steps(
     job: RolloutJob, envs: Sequence[Environment], seeds: Iterable[int], act: Act | None = None
 ) -> Iterator[Transition]:
-    """Run a job's episodes in these environments and yield every step. act: replaces the job's
-    driver.
+    """Run a job's episodes in these environments and yield every step.
+
+    Args:
+        job: The driver and the rules of the episodes.
+        envs: Environments of the job, which run in lockstep.
+        seeds: One for each episode.
+        act: Chooses the actions in place of the job's driver; None: the driver does.
+
+    Returns:
+        The transitions, in the order of `rollout`.
+
+    Raises:
+        MismatchError: if a policy does not fit the environment or the recorded cameras.
     """
     policies = tuple(_load(job, checkpoint) for checkpoint in job.driver.policies)
     setting = Setting(envs[0].actions, job.env.horizon, policies)

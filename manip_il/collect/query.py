@@ -32,9 +32,15 @@ _STREAM = "ask"  # random stream; another name would draw other states
 
 @dataclass(frozen=True)
 class Query:
-    """A rule for when the expert is queried, one of `RULES`. bound: None for rules without one.
+    """A rule for when the expert is queried.
 
-    Raises `UnknownName` for an unknown kind, `UsageError` for a bound outside the rule's range.
+    Attributes:
+        kind: One of `RULES`.
+        bound: The rule's bound; None for rules without one.
+
+    Raises:
+        UnknownName: for an unknown kind.
+        UsageError: for a bound outside the rule's range.
     """
 
     kind: str = "every"
@@ -152,6 +158,18 @@ def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
 
     For `one` without takeover this rule never queries: `labelled` labels the drawn step when the
     episode is over.
+
+    Args:
+        label: What the expert returns; with `last` it is queried only in the last step before the
+            horizon.
+        query: The rule for all other labels.
+        setting: What the rule knows about its rollouts.
+
+    Returns:
+        The started rule, for the episodes of one process.
+
+    Raises:
+        UsageError: if `setting` has too few policies for the rule.
     """
     if label == "last":
         return lambda turns, actions: [turn.step == setting.horizon - 1 for turn in turns]
@@ -161,9 +179,15 @@ def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
 
 
 def labelled(frames: list[Transition], query: Query, expert: Expert) -> list[Transition]:
-    """Return an episode's frames.
+    """Have the expert label one random step of an episode if the query is `one`.
 
-    If the query is `one`, first have the expert label one random step.
+    Args:
+        frames: The episode's frames; the list is changed in place.
+        query: The rule by which the episode was recorded.
+        expert: Labels the drawn step.
+
+    Returns:
+        The same list of frames.
     """
     if query.kind == "one":
         step = drawn_step(frames[0].seed, len(frames))
@@ -184,7 +208,15 @@ def cut_at_takeover(frames: list[Transition]) -> tuple[list[Transition], int]:
 def branch(
     env: Environment, expert: Expert, first: State, seed: int, steps: int
 ) -> Iterator[Transition]:
-    """Yield the expert's next steps from a state; the last one is `done`."""
+    """Yield the expert's next steps from a state; the last one is `done`.
+
+    Args:
+        env: The environment in which the expert drives; its own state is lost.
+        expert: Chooses and labels every action.
+        first: The state in which the branch begins.
+        seed: Seed of the yielded transitions.
+        steps: Number of control steps.
+    """
     yield from rollout([env], [seed], expert_actions, Rules(steps), expert, first=first)
 
 

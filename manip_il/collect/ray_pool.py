@@ -42,9 +42,13 @@ _DEATHS = (
 
 
 class RayPool:
-    """Runs up to `workers` tasks at once, one core each; None for one task per core of the cluster.
+    """Runs several tasks at once on a Ray cluster, with one core for each.
 
-    Raises `ManipError` if no cluster can be reached or started.
+    Args:
+        workers: Largest number of concurrent tasks; None for one per core of the cluster.
+
+    Raises:
+        ManipError: if no cluster can be reached or started.
     """
 
     def __init__(self, workers: int | None):
@@ -67,7 +71,16 @@ class RayPool:
     def submit(
         self, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None
     ) -> Future[list[Episode]]:
-        """Submit some seeds of a job to the cluster."""
+        """Submit some seeds of a job to the cluster.
+
+        Args:
+            job: The job, with paths on this machine.
+            seeds: One for each episode of the task.
+            journal: Where this process stores returned episodes; None to store none.
+
+        Returns:
+            The future of the episodes, which come without pictures.
+        """
         files = [self._upload(policy.path) for policy in job.driver.policies]
         task = self._upload(job.env.task) if isinstance(job.env.task, Path) else None
         mesh = self._upload(path) if (path := mesh_path(job.env.object)) else None
@@ -126,9 +139,23 @@ def run_there(
     mesh: Files | None,
     *policies: Files,
 ) -> bytes:
-    """Run seeds on a node; return packed episodes and journals.
+    """Run seeds on a node, and return the packed episodes and journals.
 
-    Raises `ManipError` unless the node runs `version`.
+    Args:
+        version: Version of manip_il on the machine that submitted the job.
+        job: The job, with paths on that machine.
+        seeds: One for each episode.
+        journal: Encodes the episodes; None for no journals.
+        task: Content of the user's own task's files, by relative path; None if the task has none.
+        mesh: The same for the mesh of the object.
+        policies: The same for the folder of each of the driver's policies.
+
+    Returns:
+        The pickled and compressed list of episodes, without pictures, each with its journal as
+        bytes.
+
+    Raises:
+        ManipError: if the node runs another version.
     """
     if version != __version__:
         node = ray.util.get_node_ip_address()

@@ -52,9 +52,17 @@ def collect(
 
     Each finished episode is written at once.
 
-    Yields what `read_journal` returns for each seed, in seed order, as soon as all earlier seeds
-    are done. on_episode: called when an episode is on disk; an exception in it ends the run, and
-    finished episodes stay on disk.
+    Args:
+        engine: Runs the episodes.
+        job: The job to which the seeds belong.
+        seeds: One for each episode.
+        journals: Folder of the journals.
+        on_episode: Called when an episode is on disk. An exception in it ends the run, and finished
+            episodes stay on disk.
+
+    Yields:
+        What `read_journal` returns for each seed, in the order of `seeds`, as soon as all earlier
+        ones are done.
     """
     journal = journal_of(journals, job)
     waiting = deque(seeds)
@@ -82,9 +90,22 @@ def collect_successes(
 ) -> Iterator[tuple[Journal, Episode]]:
     """Run seeds in order until `count` episodes have succeeded.
 
-    Yield all episodes as `collect` does.
+    The episodes depend on the seeds alone.
 
-    The episodes depend on the seeds alone. Raises `ManipError` if too few succeed.
+    Args:
+        engine: Runs the episodes.
+        job: The job to which the seeds belong.
+        seeds: Seeds to try, in this order.
+        count: Number of successes wanted.
+        journals: Folder of the journals.
+        on_episode: As in `collect`.
+
+    Yields:
+        All episodes, failed ones too, as `collect` does.
+
+    Raises:
+        ManipError: if reaching `count` would take more than the given seeds, or more than
+            `MAX_TRIES` times `count` tries.
     """
     tried, good = 0, 0
     while good < count:

@@ -18,10 +18,17 @@ GROWTH = 0.01  # smallest increase of a task's progress, in [0, 1], that counts
 
 @dataclass(slots=True)
 class Turn:
-    """One running episode at one step, as a driver sees it. label: None if the expert was not
-    queried.
+    """One running episode at one step, as a driver sees it.
 
-    environment: it is in this state until the turn ends.
+    Attributes:
+        seed: Seed of the episode.
+        step: Number of the control step, from 0.
+        observation: What a policy observes.
+        state: State in which the action is chosen.
+        expert: The expert that can be queried; None if there is none.
+        label: The expert's label; None if the expert was not queried.
+        progress: Share of the task that is done, 0 to 1.
+        environment: The episode's environment, which is in this state until the turn ends.
     """
 
     seed: int
@@ -63,10 +70,14 @@ that would be executed.
 class Rules:
     """When an episode ends.
 
-    horizon: most control steps. hold: continue for this many steps after success, then end; None:
-    to the horizon. patience: also end after this many steps without progress. takeover: once
-    queried, the expert drives to the end, for at most `horizon` steps more than the learner alone
-    has.
+    Attributes:
+        horizon: Largest number of control steps.
+        hold: Control steps for which an episode continues after success; None: it continues to the
+            horizon.
+        patience: Control steps without progress after which an episode also ends; None: it never
+            does so.
+        takeover: Whether the expert, once queried, drives to the end. It may then take `horizon`
+            steps more than the learner alone has.
     """
 
     horizon: int
@@ -104,11 +115,19 @@ def rollout(
     *,
     first: State | None = None,
 ) -> Iterator[Transition]:
-    """Run one episode per seed, `len(envs)` at a time; yield the transition of every step.
+    """Run one episode per seed, `len(envs)` at a time, and yield the transition of every step.
 
     An environment whose episode ends takes the next seed. An episode depends on its seed alone, not
-    on other episodes. gate: when to query the expert; None: only if `act` does. first: start state
-    of every episode; None: drawn by seed.
+    on other episodes.
+
+    Args:
+        envs: Environments that run in lockstep.
+        seeds: One for each episode.
+        act: Chooses the actions of all running episodes in a step.
+        rules: When an episode ends.
+        expert: Labels the states in which it is queried.
+        gate: When to query the expert; None: only if `act` does.
+        first: Start state of every episode; None: it is drawn by seed.
     """
     waiting = iter(seeds)
     running = [slot for env in envs if (slot := _next_episode(env, waiting, first)) is not None]

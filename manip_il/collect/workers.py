@@ -39,10 +39,15 @@ _CONTEXT = multiprocessing.get_context("forkserver")
 
 
 class Engine:
-    """Runs rollout jobs; use as a context manager. Workers live as long as the engine.
+    """Runs rollout jobs; use it as a context manager. Workers live as long as the engine.
 
-    workers: processes, 1 for this process alone; on Ray the number of concurrent tasks; None for
-    one per core.
+    Args:
+        workers: Number of processes, 1 for this process alone; on Ray the number of concurrent
+            tasks; None for one per core.
+        backend: Where the workers run: `local` for this machine, `ray` for a Ray cluster.
+
+    Raises:
+        UsageError: if `workers` is less than 1.
     """
 
     def __init__(self, workers: int | None = 1, backend: Backend = "local"):
@@ -57,8 +62,15 @@ class Engine:
     ) -> Iterator[Episode]:
         """Yield one episode per seed, in no fixed order, when it has ended and is in the journal.
 
-        Episodes from other processes come without pictures. Raises what the job raises, and
-        `ManipError` if a seed that ran alone kills its worker.
+        Episodes from other processes come without pictures.
+
+        Args:
+            job: The job to which the seeds belong.
+            seeds: One for each episode.
+            journal: Where finished episodes are written; None to write none.
+
+        Raises:
+            ManipError: if a seed that ran alone kills its worker; also what the job raises.
         """
         if self._backend == "local" and (
             self.workers == 1 or (len(seeds) == 1 and self._pool is None)
@@ -74,8 +86,10 @@ class Engine:
             raise
 
     def warm_up(self, learned: bool) -> None:
-        """Start the workers' server in the background. learned: whether the workers will run
-        policies.
+        """Start the workers' server in the background.
+
+        Args:
+            learned: Whether the workers will run policies.
         """
         if self._backend == "local" and self.workers != 1:
             start_server(learned)
@@ -143,7 +157,16 @@ class LocalPool:
     def submit(
         self, job: RolloutJob, seeds: Seeds, journal: Journal | None
     ) -> Future[list[Episode]]:
-        """Submit some seeds of a job."""
+        """Submit some seeds of a job.
+
+        Args:
+            job: The job to which the seeds belong.
+            seeds: One for each episode of the task.
+            journal: Where the worker writes finished episodes; None to write none.
+
+        Returns:
+            The future of the episodes, which come without pictures.
+        """
         self._pool = self._pool or open_pool(self.count, learned=job.policy is not None)
         try:
             return self._pool.submit(_in_worker, run_task, job, seeds, journal)
@@ -163,8 +186,14 @@ def map_in_order[T, R](
 ) -> Generator[tuple[T, R]]:
     """Yield each item with its result, in order; at most `workers` + 1 of them are in memory.
 
-    With one worker this process does the work, else items and results are pickled. Raises
-    `ManipError` if a worker dies.
+    Args:
+        function: Computes an item's result.
+        items: Taken one by one.
+        workers: Number of processes. With 1 this process does the work, else items and results are
+            pickled.
+
+    Raises:
+        ManipError: if a worker dies.
     """
     if workers == 1:
         yield from ((item, function(item)) for item in items)
@@ -187,7 +216,12 @@ def map_in_order[T, R](
 
 
 def open_pool(workers: int, *, learned: bool = False) -> ProcessPoolExecutor:
-    """Return a pool of processes, which start on demand. learned: as in `start_server`."""
+    """Return a pool of processes, which start on demand.
+
+    Args:
+        workers: Largest number of processes.
+        learned: As in `start_server`.
+    """
     start_server(learned)
     with writing(Path("/dev/shm")):  # where the pool's locks are
         return ProcessPoolExecutor(workers, mp_context=_CONTEXT, initializer=_end_with_parent)
@@ -204,8 +238,10 @@ def kill_pool(pool: ProcessPoolExecutor) -> None:
 def start_server(learned: bool) -> None:
     """Start, once per process, the background server that workers are forked from.
 
-    learned: also import policies. The server keeps the current environment variables, but uses one
-    OpenMP thread.
+    The server keeps the current environment variables, but uses one OpenMP thread.
+
+    Args:
+        learned: Whether to also import policies.
     """
     _CONTEXT.set_forkserver_preload(
         ["manip_il.collect.job", *(["manip_il.learn.policy"] if learned else [])]
@@ -237,7 +273,13 @@ def _wait_for_parent() -> None:
 
 
 def run_seeds(job: RolloutJob, seeds: Sequence[int], journal: Journal | None) -> Iterator[Episode]:
-    """Yield each seed's episode when it has ended and is in the journal."""
+    """Yield each seed's episode when it has ended and is in the journal.
+
+    Args:
+        job: The job to which the seeds belong.
+        seeds: One for each episode.
+        journal: Where finished episodes are written; None to write none.
+    """
     for episode in job.run(seeds):
         if journal is not None:
             journal.write(episode)
@@ -245,7 +287,13 @@ def run_seeds(job: RolloutJob, seeds: Sequence[int], journal: Journal | None) ->
 
 
 def run_task(job: RolloutJob, seeds: Seeds, journal: Journal | None) -> list[Episode]:
-    """Run some seeds in a local worker; return their episodes without pictures."""
+    """Run some seeds in a local worker, and return their episodes without pictures.
+
+    Args:
+        job: The job to which the seeds belong.
+        seeds: One for each episode.
+        journal: Where finished episodes are written; None to write none.
+    """
     return [episode.without_pictures() for episode in run_seeds(job, seeds, journal)]
 
 
@@ -263,8 +311,18 @@ def _in_worker[**P, R](function: Callable[P, R], *arguments: P.args, **options: 
 
 
 def split(job: RolloutJob, seeds: Sequence[int], workers: int) -> deque[Seeds]:
-    """Split seeds into tasks: of one seed or, if a learner drives, of a batch small enough to
-    keep all workers busy.
+    """Split seeds into tasks for workers.
+
+    A task is one seed or, if a learner drives, a batch that is small enough to keep all workers
+    busy.
+
+    Args:
+        job: The job to which the seeds belong.
+        seeds: One for each episode.
+        workers: Number of tasks that run at once.
+
+    Returns:
+        The tasks, in the order of the seeds.
     """
     size = 1 if job.policy is None else max(1, min(job.batch, -(-len(seeds) // workers)))
     return deque(tuple(seeds[i : i + size]) for i in range(0, len(seeds), size))

@@ -47,9 +47,13 @@ TASK_HELP = (
 class EnvConfig(Episodes):
     """Settings of one environment; every field is part of the fingerprint.
 
-    robot, task: a name, or the `Path` of a user's own file. object: shape and size of what is
-    grasped, as `ObjectShape.parse` reads it, or the `Path` of a mesh; empty for the task's default.
     A name that was stored is a `str`, which no code takes for a path.
+
+    Attributes:
+        robot: A name, or the `Path` of a user's own file.
+        task: The same for the task.
+        object: Shape and size of what is grasped, as `ObjectShape.parse` reads it, or the `Path` of
+            a mesh; empty for the task's default.
     """
 
     robot: NameOrPath = option("panda", ROBOT_HELP, flag="robot.type")

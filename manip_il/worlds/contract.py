@@ -142,7 +142,12 @@ class EnvironmentSpec:
         return {KEYPOINTS + camera: camera for camera in self.cameras if self.keypoints}
 
     def require(self, ability: Ability, advice: str) -> None:
-        """Raise `Unable` unless the environment has an ability. advice: what to do instead."""
+        """Raise `Unable` unless the environment has an ability.
+
+        Args:
+            ability: What is to be done with the environment.
+            advice: What the user should do instead, for the message.
+        """
         if ability not in self.can:
             raise Unable(f"{self.robot} cannot be {ability}; {advice}")
 
@@ -240,9 +245,12 @@ class Expert(Protocol):
     def label(self, state: State, environment: Environment | None = None) -> Label:
         """Return the expert's action (n,) in a state.
 
-        Raises `MismatchError` for a state of another scene.
+        Args:
+            state: The state to label.
+            environment: One that is already in this state; it is only read.
 
-        environment: one that is already in this state; it is only read.
+        Raises:
+            MismatchError: for a state of another scene.
         """
         ...
 
@@ -257,7 +265,13 @@ class WorldKind:
     def environment(
         self, config: EnvConfig, cameras: CameraConfig | None, conditions: Sequence[Condition]
     ) -> Environment:
-        """Return an environment, which can do what `cameras` and `conditions` need."""
+        """Return an environment, which can do what `cameras` and `conditions` need.
+
+        Args:
+            config: Its settings, complete.
+            cameras: Cameras rendered in every step; None for none.
+            conditions: How episodes differ from the nominal world, in turn by seed.
+        """
         raise NotImplementedError
 
     def expert(self, config: EnvConfig) -> Expert:
@@ -279,9 +293,15 @@ class WorldKind:
         raise NotImplementedError
 
     def own_files(self, robot: str, task: str, shape: str) -> list[str]:
-        """Return the options, with FILE for a path, that name what is not built in.
+        """Return the options that commands need for what is not built in.
 
-        [] if everything is.
+        Args:
+            robot: Name of the robot.
+            task: Name of the task.
+            shape: The object, as a dataset stores it; empty for the task's default.
+
+        Returns:
+            Options with FILE for a path; [] if everything is built in.
         """
         return []
 
@@ -290,15 +310,23 @@ class WorldKind:
         return []
 
     def success(self, tolerance: float, steps: int) -> str:
-        """Return in words when an episode is a success. tolerance: [m].
+        """Return in words when an episode is a success.
 
-        steps: control steps within it.
+        Args:
+            tolerance: Largest error [m].
+            steps: Control steps in a row that must be within the tolerance.
         """
         return "as the environment itself reports it"
 
     def affecting(self, config: EnvConfig, condition: Condition, *, sees: bool) -> Condition | None:
         """Return the part of a condition that changes something.
 
-        None if nothing does. sees: with cameras.
+        Args:
+            config: Settings of the environment.
+            condition: Ranges of what differs from the nominal world.
+            sees: Whether the policy has cameras.
+
+        Returns:
+            The condition without ranges that have no effect; None if it had some and none is left.
         """
         return None if condition.ranges else condition

@@ -33,8 +33,12 @@ TOLERANCE = 0.05  # Fetch's; another environment that reports success by itself 
 
 
 class PackagedRung(NamedTuple):
-    """A phase of an expert. holds, target: functions of what the expert reads from the state to
-    label.
+    """A phase of an expert.
+
+    Attributes:
+        name: Name of the phase.
+        holds: Returns whether the rung holds, from what the expert reads from the state.
+        target: Returns the rung's target, from the same.
     """
 
     name: str
@@ -137,9 +141,11 @@ class PackagedEnv(Environment):
 
 
 class Packaged(WorldKind):
-    """The environments of another package. cls: of its environments.
+    """The environments of another package.
 
-    teach: returns the expert of a task.
+    Args:
+        cls: Class of the environments.
+        teach: Returns the expert of a task, by its name.
     """
 
     def __init__(self, cls: type[PackagedEnv], teach: Callable[[str], Expert]):
@@ -167,6 +173,13 @@ class Packaged(WorldKind):
     def environment(
         self, config: EnvConfig, cameras: CameraConfig | None, conditions: Sequence[Condition]
     ) -> PackagedEnv:
+        """Return the package's environment of a task.
+
+        Args:
+            config: Its settings, complete; the package has its own for all but task and horizon.
+            cameras: Cameras rendered in every step; None for none.
+            conditions: Without ranges, as these environments cannot be varied.
+        """
         env = self._cls(str(config.task), cameras)
         env.horizon = config.horizon
         return env
@@ -181,6 +194,16 @@ class Packaged(WorldKind):
 
     @override
     def own_files(self, robot: str, task: str, shape: str) -> list[str]:
+        """Return the option that names a task if the package has none of this name.
+
+        Args:
+            robot: Not used.
+            task: Name of the task.
+            shape: Not used.
+
+        Returns:
+            One option, with the names of all tasks; [] if the package has the task.
+        """
         return [] if task in self._tasks else [f"--task.type={'|'.join(self._tasks)}"]
 
     @override

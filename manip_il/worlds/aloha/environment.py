@@ -57,9 +57,14 @@ class AlohaActions(ActionSpace):
 
 
 class AlohaEnv(PackagedEnv):
-    """An environment of `gym_aloha`. task: a key of `ALOHA_TASKS`. cameras: rendered in every step.
+    """An environment of `gym_aloha`.
 
-    Raises `ManipError` if the package is not installed.
+    Args:
+        task: A key of `ALOHA_TASKS`.
+        cameras: Cameras rendered in every step; None for none.
+
+    Raises:
+        ManipError: if the package is not installed.
     """
 
     robot, action_meaning = "aloha", TWO_ARMS

@@ -41,11 +41,12 @@ MOST_TURN = 0.3  # largest turn of an object in a step [rad]
 
 @dataclass(frozen=True)
 class Held:
-    """Half gaps between the fingers for one object [m]. open: smallest that clears it.
+    """Half gaps between the fingers for one object.
 
-    thin: smallest that holds it.
-
-    long: whether the object is longest along its own x axis.
+    Attributes:
+        open: Smallest half gap that clears the object [m].
+        thin: Smallest half gap that holds it [m].
+        long: Whether the object is longest along its own x axis.
     """
 
     open: float
@@ -55,11 +56,14 @@ class Held:
 
 @dataclass(frozen=True)
 class Hand:
-    """One hand: its position (3,) [m], axes (ahead, across, up) (3, 3), and half the gap between
-    its fingers [m].
+    """One hand in one state.
 
-    q: joints of its arm, (6,) [rad]. outward: its across axis, (3,), if the arm reaches straight to
-    the table's middle.
+    Attributes:
+        position: Position of the hand, (3,) [m].
+        rotation: Its axes, which point ahead, across and up, (3, 3).
+        gap: Half the gap between its fingers [m].
+        q: Joints of its arm, (6,) [rad].
+        outward: Its across axis if the arm reaches straight to the table's middle, (3,).
     """
 
     position: F64
@@ -75,7 +79,13 @@ class Hand:
 
 @dataclass(frozen=True)
 class Thing:
-    """One object: its middle (3,) [m], its axes (3, 3), and how it is held."""
+    """One object in one state.
+
+    Attributes:
+        position: Middle of the object, (3,) [m].
+        axes: Its axes, (3, 3).
+        about: How it is held.
+    """
 
     position: F64
     axes: F64
@@ -98,10 +108,17 @@ class Thing:
 
 @dataclass(frozen=True)
 class AlohaTask:
-    """One task of `gym_aloha`. own: its name there. grasped: the hand that takes each object.
+    """One task of `gym_aloha`.
 
-    scene: the facts that its rungs read; rungs: those of each hand, latest first. inserted: an
-    object, and the object that it goes into; empty if nothing is inserted.
+    Attributes:
+        name: Name of the task.
+        instruction: The task in words, for policies that read them.
+        own: Its name in `gym_aloha`.
+        objects: Object -> how it is held.
+        grasped: Object -> the hand that takes it.
+        scene: Facts that the rungs read.
+        rungs: Hand -> its rungs, the latest first.
+        inserted: An object, and the object that it goes into; empty if nothing is inserted.
     """
 
     name: str
@@ -124,6 +141,11 @@ class AlohaScene:
     """Hands, objects and contacts in one state.
 
     A task's own subclass adds the facts that its rungs need.
+
+    Args:
+        task: The task, which names the objects.
+        model: The environment's model.
+        data: The environment's data, with poses and contacts of the state.
     """
 
     def __init__(self, task: AlohaTask, model: mujoco.MjModel, data: mujoco.MjData):
@@ -165,8 +187,12 @@ class AlohaScene:
         )
 
     def is_at_grasp(self, side: str, name: str, rotation: F64) -> bool:
-        """Return whether a hand may close, or keep closing, on an object. rotation: the grasp's,
-        (3, 3).
+        """Return whether a hand may close, or keep closing, on an object.
+
+        Args:
+            side: The hand, `left` or `right`.
+            name: The object.
+            rotation: Rotation of the grasp, (3, 3).
         """
         hand, thing = self.hands[side], self.things[name]
         if hand.gap < thing.about.thin:  # closed beside it: open again
@@ -239,7 +265,13 @@ def pitched(across: F64, pitch: float) -> F64:
 
 
 def read_hand(side: str, number: int, data: mujoco.MjData) -> Hand:
-    """Return a hand as it is in `data`. number: 0 for the left one, 1 for the right one."""
+    """Return a hand as it is in `data`.
+
+    Args:
+        side: The hand, `left` or `right`.
+        number: 0 for the left one, 1 for the right one.
+        data: The environment's data, with poses up to date.
+    """
     *q, one, other = data.qpos[8 * number : 8 * number + 8].tolist()
     site, gap = data.site(f"cali_{side}_site1"), 0.5 * (one - other) - FINGER_AT_TOUCH
     rotation, outward = site.xmat.reshape(3, 3).copy(), Y if side == "left" else -Y
@@ -262,7 +294,14 @@ class HandTarget(NamedTuple):
 
 
 def close_on(scene: AlohaScene, name: str, rotation: F64, longest: float = FAST) -> HandTarget:
-    """Close the fingers on the object. rotation: the grasp's, (3, 3)."""
+    """Return the target that closes the fingers on an object.
+
+    Args:
+        scene: The state.
+        name: The object.
+        rotation: Rotation of the grasp, (3, 3).
+        longest: Longest step of a joint [rad].
+    """
     return HandTarget(
         scene.things[name].position - GRASP_AHEAD * rotation[:, 0], rotation, CLOSED, longest
     )
@@ -271,9 +310,19 @@ def close_on(scene: AlohaScene, name: str, rotation: F64, longest: float = FAST)
 def approach(
     scene: AlohaScene, side: str, name: str, rotation: F64, back: float = 0.0, longest: float = FAST
 ) -> HandTarget:
-    """Approach an object with open fingers, in a funnel along the grasp's axis.
+    """Return the target that approaches an object with open fingers, in a funnel.
 
-    rotation: the grasp's, (3, 3). back: least distance to keep from the object [m].
+    The hand moves along the grasp's axis. It keeps a distance of `SLOPE` (e - `TOLERANCE`) from the
+    object, between `back` and `STANDOFF`, where the error e is its sideways offset plus `ARM` times
+    its angle to the grasp. Until its fingers are open, it also stays up to `OPENING_STANDOFF` away.
+
+    Args:
+        scene: The state.
+        side: The hand, `left` or `right`.
+        name: The object.
+        rotation: Rotation of the grasp, (3, 3).
+        back: Least distance to keep from the object [m].
+        longest: Longest step of a joint [rad].
     """
     hand, thing = scene.hands[side], scene.things[name]
     off = rotation.T @ (thing.position - hand.position)
@@ -290,8 +339,12 @@ def approach(
 def take_rungs(
     side: str, name: str, grasp: Callable[[Any], F64]
 ) -> tuple[PackagedRung, PackagedRung]:
-    """Return the rungs of a hand that takes an object from the table. grasp: scene -> the hand's
-    rotation, (3, 3).
+    """Return the rungs of a hand that takes an object from the table, the latest first.
+
+    Args:
+        side: The hand, `left` or `right`.
+        name: The object.
+        grasp: Returns the rotation of the grasp in a scene, (3, 3).
     """
     return (
         PackagedRung(
@@ -306,7 +359,16 @@ def take_rungs(
 def move_object(
     scene: AlohaScene, side: str, name: str, to: F64, frame: F64, longest: float
 ) -> HandTarget:
-    """Bring a held object to a place (3,) [m], and turn its `Thing.frame` to `frame` (3, 3)."""
+    """Return the target that brings a held object to a place and turns it.
+
+    Args:
+        scene: The state.
+        side: The hand that holds the object, `left` or `right`.
+        name: The object.
+        to: The place, (3,) [m].
+        frame: The rotation that the object's `Thing.frame` is to have, (3, 3).
+        longest: Longest step of a joint [rad].
+    """
     hand, thing = scene.hands[side], scene.things[name]
     turn = turned_towards(np.eye(3), frame @ thing.frame.T, MOST_TURN)
     return HandTarget(

@@ -22,9 +22,14 @@ STATE_NAMES = ("gripper.x", "gripper.y", "gripper.z", "gripper.opening")
 
 @dataclass(frozen=True)
 class FetchTask:
-    """A task of Fetch. has_object: the goal is for a cube, not for the gripper.
+    """A task of Fetch.
 
-    blocked: the fingers stay closed.
+    Attributes:
+        name: Name of the environment in gymnasium-robotics.
+        instruction: The task in words, for policies that read them.
+        has_object: Whether the goal is for a cube, and not for the gripper.
+        blocked: Whether the fingers stay closed.
+        phases: Names of the phases of all tasks.
     """
 
     name: str
@@ -57,7 +62,12 @@ ACTIONS = FetchActions(
 
 
 class FetchEnv(PackagedEnv):
-    """An environment of gymnasium-robotics. task: the environment's name there."""
+    """An environment of gymnasium-robotics.
+
+    Args:
+        task: The environment's name there.
+        cameras: Not used, as no camera draws these environments.
+    """
 
     robot = "fetch_stock"
     action_meaning = (

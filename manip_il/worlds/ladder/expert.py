@@ -37,12 +37,16 @@ class LadderExpert(Expert):
     def label(self, state: State, environment: Environment | ManipEnv | None = None) -> Label:
         """Return the expert's action in `state`: joint targets [rad] and gripper command [m], (n,).
 
-        environment: one of the same scene that is already in this state, with poses up to date; it
-        is only read.
+        If there is no sound action (the object is out of reach, or inverse kinematics has no
+        solution), `valid` is false, `reason` says why, and the action holds the arm still.
 
-        If there is no sound action (object out of reach, inverse kinematics without a solution),
-        `valid` is false, `reason` says why, and the action holds the arm still. Raises
-        `MismatchError` for a state of another scene.
+        Args:
+            state: The state to label.
+            environment: One of the same scene that is already in this state, with poses up to date;
+                it is only read.
+
+        Raises:
+            MismatchError: for a state of another scene.
         """
         if isinstance(environment, ManipEnv) and environment.scene is self._scene:
             world = environment.world

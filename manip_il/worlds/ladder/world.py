@@ -53,9 +53,16 @@ from manip_il.worlds.table import make_config
 
 
 def scene_of(robot: NameOrPath, task: NameOrPath, shape: NameOrPath = "") -> Scene:
-    """Return the compiled scene of a robot, a task and an object, as in `EnvConfig`.
+    """Return the compiled scene of a robot, a task and an object.
 
-    Raises `UnknownName`, `UsageError`.
+    Args:
+        robot: Its name, or the `Path` of its YAML.
+        task: Its name, or the `Path` of its Python file.
+        shape: The object, as in `EnvConfig`; empty for the task's default.
+
+    Raises:
+        UnknownName: for a robot or a task.
+        UsageError: if the scene cannot be built.
     """
     return build_scene(get_robot(robot), get_task(task, shape))
 
@@ -68,7 +75,13 @@ def config_scene(config: EnvConfig) -> Scene:
 def env_of(
     config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
 ) -> ManipEnv:
-    """Return the environment that these settings describe."""
+    """Return the environment that these settings describe.
+
+    Args:
+        config: The settings, complete.
+        cameras: Cameras rendered in every step; None for none.
+        conditions: How episodes differ from the nominal world, in turn by seed.
+    """
     return ManipEnv(*parts_of(config), config, cameras=cameras, conditions=conditions)
 
 
@@ -83,12 +96,22 @@ def make_env(
     conditions: Sequence[Condition] = (),
     **settings: Any,
 ) -> ManipEnv:
-    """Return the environment of a robot, by its name or its YAML's path, and a task, by its name or
-    its file's path.
+    """Return the environment of a robot and a task.
 
-    cameras: names; image_size: height and width of their pictures [pixels]. settings: fields of
-    `EnvConfig`; the rest is as in `ManipEnv`. Raises what `make_config`, `CameraConfig` and
-    `ManipEnv` raise.
+    Args:
+        robot: Its name, or the path of its YAML.
+        task: Its name, or the path of its Python file.
+        cameras: Names of the cameras rendered in every step.
+        image_size: Height and width of their pictures [pixels].
+        look: As in `ManipEnv`.
+        render_mode: As in `ManipEnv`.
+        conditions: As in `ManipEnv`.
+        settings: Other fields of `EnvConfig`.
+
+    Raises:
+        UnknownName: for a robot, a task, a camera or a `render_mode`.
+        UsageError: for any other wrong value.
+        RenderError: for the `render_mode` `human` without a display.
     """
     config = make_config(robot, task, **settings)
     seen = CameraConfig(tuple(cameras), *image_size, look or Look()) if cameras else None
@@ -119,9 +142,13 @@ _DEEP = 1e-3  # largest overlap of a moved object with another [m]
 def redrawn(world: World, visited: State, rng: np.random.Generator) -> State | None:
     """Return a scene with new goals and new places of untouched objects.
 
-    None if the drawn places overlap.
+    Args:
+        world: The world in which the scene is made; its own state is lost.
+        visited: The state that is changed into the scene.
+        rng: Draws what changes.
 
-    world: restored and changed.
+    Returns:
+        The new state; None if the drawn places overlap.
     """
     task = world.scene.task
     world.restore(visited.physics, visited.variation)
@@ -188,7 +215,13 @@ _TURNED = ("carry", "insert", "insert_tight", "press")
 
 
 class LadderEnv(ManipEnv, Environment):
-    """`ManipEnv` behind the contract, whose `step` it has in place of gymnasium's."""
+    """`ManipEnv` behind the contract, whose `step` it has in place of gymnasium's.
+
+    Args:
+        config: Settings of the environment, complete.
+        cameras: Cameras rendered in every step; None for none.
+        conditions: How episodes differ from the nominal world, in turn by seed.
+    """
 
     def __init__(
         self, config: EnvConfig, cameras: CameraConfig | None, conditions: Sequence[Condition]
@@ -284,6 +317,13 @@ class LadderKind(WorldKind):
     def environment(
         self, config: EnvConfig, cameras: CameraConfig | None, conditions: Sequence[Condition]
     ) -> LadderEnv:
+        """Return the environment of a robot at a task.
+
+        Args:
+            config: Its settings, complete.
+            cameras: Cameras rendered in every step; None for none.
+            conditions: How episodes differ from the nominal world, in turn by seed.
+        """
         return LadderEnv(config, cameras, conditions)
 
     @override
@@ -319,6 +359,16 @@ class LadderKind(WorldKind):
 
     @override
     def own_files(self, robot: str, task: str, shape: str) -> list[str]:
+        """Return the options for a robot, a task and a mesh of the user's own.
+
+        Args:
+            robot: Name of the robot.
+            task: Name of the task.
+            shape: The object, as a dataset stores it; empty for the task's default.
+
+        Returns:
+            Options with FILE for a path; [] if everything is built in.
+        """
         robots = [] if is_robot(robot) else ["--robot.type=FILE.yaml"]
         meshes = ["--task.object=mesh:FILE:LENGTH"] if shape.startswith(MESH) else []
         return [*robots, *([] if is_task(task) else ["--task.type=FILE.py"]), *meshes]
@@ -339,6 +389,19 @@ class LadderKind(WorldKind):
 
     @override
     def affecting(self, config: EnvConfig, condition: Condition, *, sees: bool) -> Condition | None:
+        """Return the part of a condition that changes something for this task and policy.
+
+        Args:
+            config: Settings of the environment.
+            condition: Ranges of what differs from the nominal world.
+            sees: Whether the policy has cameras.
+
+        Returns:
+            The condition as `Condition.for_world` returns it; None if nothing in it has an effect.
+
+        Raises:
+            UsageError: if the task can take none of the condition's object sizes.
+        """
         task = get_task(config.task, config.object)
         return condition.for_world(has_object=bool(task.objects), sees=sees, sizes=task.sizes)
 
