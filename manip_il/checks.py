@@ -95,7 +95,16 @@ def repo_id(what: str, value: object) -> str:
 
 
 def text(what: str, value: object, longest: int = LONGEST_TEXT) -> str:
-    """Return a string of at most `longest` characters, all of them Unicode."""
+    """Return a string of at most `longest` characters, all of them Unicode.
+
+    Args:
+        what: The name of the value, for the message.
+        value: The value to check.
+        longest: The greatest length [characters].
+
+    Raises:
+        ManipError: The value is not a string, is too long, or holds a lone surrogate.
+    """
     if not isinstance(value, str) or len(value) > longest or _SURROGATE.search(value):
         raise ManipError(
             f"{what} is {shorten(value)}; expected text of at most {longest} characters, in Unicode"
@@ -104,7 +113,17 @@ def text(what: str, value: object, longest: int = LONGEST_TEXT) -> str:
 
 
 def whole(what: str, value: object, low: int, high: int) -> int:
-    """Return an int within [low, high]; True and 3.0 are rejected."""
+    """Return an int within [low, high].
+
+    Args:
+        what: The name of the value, for the message.
+        value: The value to check.
+        low: The least number that is allowed.
+        high: The greatest number that is allowed.
+
+    Raises:
+        ManipError: The value is outside the limits or not an int; True and 3.0 are rejected.
+    """
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise ManipError(
             f"{what} is {shorten(value)}; expected a whole number from {low} to {high}"
@@ -113,7 +132,17 @@ def whole(what: str, value: object, low: int, high: int) -> int:
 
 
 def number(what: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
-    """Return a finite float within [low, high]."""
+    """Return a finite float within [low, high].
+
+    Args:
+        what: The name of the value, for the message.
+        value: The value to check, an int or a float.
+        low: The least number that is allowed.
+        high: The greatest number that is allowed.
+
+    Raises:
+        ManipError: The value is outside the limits, not finite or not a number.
+    """
     most = sys.float_info.max  # a larger int does not fit in a float
     if (
         isinstance(value, int | float)
@@ -281,11 +310,20 @@ def in_child(
     *arguments: object,
     seconds: float = SECONDS_IN_CHILD,
 ) -> None:
-    """Call `function(*arguments)` in a child process, limited to 4 GB of memory and `seconds` [s].
+    """Call a function in a child process with limited memory (4 GB) and time.
 
-    Only the text of a `ManipError` comes back, because the file is untrusted. Raises a `ManipError`
-    with that text, and one if the child exceeds its limits or dies. what: name of the file or
-    folder, for these messages; a function that opens several files calls `opening` before each.
+    Only the text of a `ManipError` comes back, because the file is untrusted.
+
+    Args:
+        what: The name of the file or folder, for the messages. A function that opens several files
+            calls `opening` before each.
+        function: The function to call; it and its arguments are pickled.
+        arguments: The arguments of the function.
+        seconds: The time limit [s].
+
+    Raises:
+        ManipError: The function raised one, whose text this one has; or the child exceeded its
+            limits or died.
     """
     command = [sys.executable, "-c", "from manip_il.checks import answer_parent; answer_parent()"]
     done = subprocess.run(

@@ -42,7 +42,16 @@ def stream_base(stream: str, seed: int = 0) -> int:
 
 
 def stream_seeds(stream: str, count: int, seed: int = 0) -> range:
-    """Return the first `count` seeds of a named stream."""
+    """Return the first seeds of a named stream.
+
+    Args:
+        stream: The name, as for `stream_base`.
+        count: The number of seeds, 0 to `BLOCK`.
+        seed: The user's `--seed`, 0 to `MAX_SEED`.
+
+    Raises:
+        UsageError: The count or the seed is out of range.
+    """
     if not 0 <= count <= BLOCK:
         raise UsageError(f"{count} seeds requested from stream {stream!r}; expected 0 to {BLOCK}")
     base = stream_base(stream, seed)

@@ -62,7 +62,12 @@ HELD_OUT = "held_out"
 class Run:
     """A run's folder, its workers, and its results so far.
 
-    config: a `RunConfig`, or, in the subclass of `manip_il.chapter.learning`, a `LearningConfig`.
+    Args:
+        config: A `RunConfig`, or, in the subclass of `manip_il.chapter.learning`, a
+            `LearningConfig`.
+        folder: The folder of the run.
+        engine: The workers that simulate the episodes.
+        progress: Follows the run.
     """
 
     def __init__(self, config: Any, folder: Path, engine: Engine, progress: Progress | None = None):
@@ -149,11 +154,16 @@ class Run:
     def rollouts(
         self, round_: int, driver: Driver, query: Query | None = None, disturbed: float = 0.0
     ) -> Rollouts:
-        """Record a round's episodes, successful or not, with the expert's labels in the mode
-        `config.label`.
+        """Record a round's episodes, successful or not, labelled in the mode `config.label`.
 
-        query: when the expert is queried; None: in every state. disturbed: share of the episodes
-        that have the disturbances `manip_il.sim.events.STANDARD`.
+        A round whose dataset exists is read, not run again.
+
+        Args:
+            round_: The number of the round.
+            driver: Chooses the actions.
+            query: When the expert is queried; None for every state.
+            disturbed: The share of the episodes that have the disturbances
+                `manip_il.sim.events.STANDARD`.
         """
         here = self._folder(round_)
         config = self.config

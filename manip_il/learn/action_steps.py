@@ -124,9 +124,14 @@ def is_in_processors(kind: str, found: Conversion) -> bool:
 
 
 def add_steps(before: Pipeline, after: Pipeline, found: Conversion) -> None:
-    """Add a conversion's steps to a policy's pre- and postprocessor.
+    """Add a conversion's steps to a policy's pre- and postprocessor, in place.
 
     The policy then sees only converted actions.
+
+    Args:
+        before: The preprocessor, which has a normaliser step.
+        after: The postprocessor.
+        found: The conversion.
     """
     measured = MeasuredJointsStep(converted=True)
     place = next(

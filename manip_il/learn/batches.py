@@ -30,8 +30,13 @@ class Order:
     """Row numbers in batches: a new shuffle of all rows every epoch, or draws in proportion to
     weights.
 
-    weights: one per row, (N,), to draw with replacement; None for epochs. A batch depends only on
-    the seed and the step, so there is no state to save.
+    A batch depends only on the seed and the step, so there is no state to save.
+
+    Args:
+        rows: The number of rows N.
+        weights: One weight per row, (N,), to draw with replacement; None for epochs.
+        batch_size: The number of rows in a batch.
+        seed: Decides all shuffles and draws.
     """
 
     def __init__(self, rows: int, weights: F64 | None, batch_size: int, seed: int) -> None:

@@ -98,8 +98,16 @@ class Origin:
         look: Mapping[str, Any] | None = None,
         **more: Any,
     ) -> Origin:
-        """Return the origin of a policy trained on data of `spec`. more: other fields of
-        `Origin`.
+        """Return the origin of a policy trained on data of `spec`.
+
+        Args:
+            spec: The specification of the training data.
+            fingerprint: The fingerprint of the training data.
+            options: The options of the fit.
+            observation: One of `OBSERVATIONS`. If it is `state`, cameras, picture size and lighting
+                are left out.
+            look: The lighting of the pictures, as arguments of `sim.look.Look`; None if unknown.
+            more: Other fields of `Origin`.
         """
         pictured = observation != "state"
         return cls(
@@ -338,11 +346,16 @@ def in_one_line(what: str) -> Iterator[None]:
 def require_trust(
     settings: Mapping[str, Any], source: str, trust: bool, steps: Sequence[Mapping[str, Any]] = ()
 ) -> None:
-    """Raise `ManipError`, listing the names, if a policy loads models or files by name, unless
-    `trust` is given.
+    """Raise `ManipError` if a policy loads models or files by name, unless `trust` is given.
 
-    settings: the policy's options with `type`, as in `config.json`. source: where they come from,
-    for the message. steps: the processors' steps.
+    Args:
+        settings: The policy's options with `type`, as in `config.json`.
+        source: Where the options come from, for the message.
+        trust: Whether the policy's source is trusted.
+        steps: The processors' steps, each with `registry_name` and `config`.
+
+    Raises:
+        ManipError: The policy is not trusted; the message lists the names.
     """
     kind, named = settings["type"], list[Any]()
     if kind not in PLAIN or settings.get("vision_encoder_name"):

@@ -26,8 +26,11 @@ Batch = dict[str, torch.Tensor]
 
 
 class LearnedPolicy:
-    """Actions from a LeRobot checkpoint, for many episodes at once. checkpoint: its inputs,
-    outputs and origin.
+    """Actions from a LeRobot checkpoint, for many episodes at once.
+
+    Args:
+        policy: The policy, loaded.
+        checkpoint: Its inputs, outputs and origin.
     """
 
     def __init__(self, policy: EpisodePolicy | _Perceptron, checkpoint: Checkpoint):
@@ -42,14 +45,22 @@ class LearnedPolicy:
         *,
         trust: bool = False,
     ) -> LearnedPolicy:
-        """Load any LeRobot `pretrained_model` folder, only from JSON and safetensors unless
-        `trust`.
+        """Load any LeRobot checkpoint, from JSON and safetensors alone unless `trust`.
 
         The mlp is loaded without LeRobot, whose import takes seconds; other policies by LeRobot's
-        own factory. task: instruction for a policy that reads language, if `begin` gives no other.
-        trust: also load models and code that the checkpoint names. Raises what `Checkpoint.open`
-        raises, `ManipError` for files that do not match or, without `trust`, that name models to
-        load; `UnknownName` for an unknown type of policy.
+        own factory.
+
+        Args:
+            checkpoint: The checkpoint, or its `pretrained_model` folder.
+            device: Torch's name for the device.
+            task: Instruction for a policy that reads language, if `begin` gives no other.
+            trust: Whether to load models and code that the checkpoint names.
+
+        Raises:
+            UsageError: The device is a GPU, but PyTorch finds none.
+            UnknownName: The type of policy is unknown.
+            ManipError: The folder is incomplete, its files do not match, or they name models to load
+                and `trust` is not given.
         """
         require_device(device)
         opened = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint.open(checkpoint)
@@ -77,14 +88,24 @@ class LearnedPolicy:
         images: Images | None = None,
         episodes: Sequence[int] | None = None,
     ) -> F64:
-        """Return absolute actions, (B, n), as in the training data: usually joint targets [rad],
-        gripper command [m].
+        """Return an absolute action for each row.
 
-        states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a
-        number for each row, by default its index; the policy's memory of an episode and its random
-        draws depend on that number. An episode that is not in `episodes` has ended. An action is
-        bit-identical whatever the other rows are. Raises `NotFiniteError` naming the row for an
-        action that is not finite, `MismatchError` for pictures that are missing or of another size.
+        An action is bit-identical whatever the other rows are.
+
+        Args:
+            states: Joint states (B, n).
+            environment_states: Environment states (B, k).
+            images: Pictures uint8 (B, H, W, 3) by camera.
+            episodes: A number for each row, by default its index. The policy's memory of an episode
+                and its random draws depend on that number. An episode that is not listed has ended.
+
+        Returns:
+            Actions (B, n), as in the training data: usually joint targets [rad] and a gripper command
+            [m].
+
+        Raises:
+            NotFiniteError: An action is not finite; the message names the row.
+            MismatchError: Pictures are missing or have another size.
         """
         if not len(states):
             return np.empty((0, self.checkpoint.action))

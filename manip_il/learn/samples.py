@@ -85,7 +85,10 @@ class Windows:
 def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) -> Windows:
     """Return the windows of a policy's training samples.
 
-    episodes: the episode of every frame, (N,).
+    Args:
+        policy: The policy's options, which define the offsets.
+        columns: The columns that the policy observes, and the action.
+        episodes: The episode of every frame, (N,), ascending.
     """
     actions, observations = policy.action_delta_indices, policy.observation_delta_indices
     wanted = {key: actions if key == ACTION else observations for key in columns}
@@ -203,12 +206,16 @@ def valid_frames(table: Table) -> NDArray[np.bool_]:
 
 
 def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I64]:
-    """Return the rows to train on and to hold out.
+    """Return the rows to train on and to hold out; whole episodes are held out.
 
-    Whole episodes are held out, about `fraction` of them.
+    Args:
+        episodes: The episode of every row, (N,).
+        fraction: Share of the episodes to hold out. Nothing is held out if it rounds to none or all
+            of them.
+        seed: Decides which episodes are held out.
 
-    episodes: the episode of every row, (N,). Nothing is held out if `fraction` rounds to none or
-    all of the episodes.
+    Returns:
+        Row numbers to train on, (N - h,), and to hold out, (h,), both ascending.
     """
     names = np.unique(episodes)
     count = round(fraction * len(names))
@@ -220,16 +227,23 @@ def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I6
 
 
 def rabc_weights(path: Path, episodes: I64, ahead: int) -> F64:
-    """Return the weight of every frame, (N,), at most 1, from a file with the progress of every
-    frame.
+    """Return the weight of every frame, from a file with the progress of every frame.
 
     The weights are those of LeRobot's RA-BC (Chen et al. 2025, arXiv:2509.25358, equations 8 and
     9). LeRobot multiplies losses by them; here samples are drawn in proportion to them, which gives
     the same mean gradient.
 
-    episodes: the dataset's `episode_index`, (N,). ahead: number of frames over which the gain in
-    progress is measured. Raises `ManipError` if the file cannot be read or every frame weighs 0,
-    `MismatchError` for another dataset's file.
+    Args:
+        path: The file, as LeRobot writes it (`rabc.parquet`).
+        episodes: The dataset's `episode_index`, (N,).
+        ahead: Number of frames over which the gain in progress is measured.
+
+    Returns:
+        Weights (N,) in [0, 1], the greatest of which is 1.
+
+    Raises:
+        ManipError: The file cannot be read, or every frame weighs 0.
+        MismatchError: The file belongs to another dataset.
     """
     from lerobot.rewards.sarm.rabc import RABCWeights  # its import takes seconds
 

@@ -81,8 +81,12 @@ def new_checkpoint(final: Path) -> Generator[Path]:
 
 
 def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -> None:
-    """Write our own files of a checkpoint: the origin, and `step`, the content of
-    `training_step.json`.
+    """Write the files of a checkpoint that LeRobot does not write.
+
+    Args:
+        checkpoint: The folder of the checkpoint.
+        origin: The content of `manip_il.json`.
+        step: The content of `training_step.json`.
     """
     for path, values in (
         (f"{PRETRAINED_MODEL}/{META_FILE}", origin.to_json()),

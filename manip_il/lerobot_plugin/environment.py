@@ -153,8 +153,13 @@ def _given(text: NameOrPath) -> NameOrPath:
 
 
 class FilmedEnv(ManipEnv):
-    """`ManipEnv` for lerobot-eval, which always films: if `film` is false, its pictures are
-    small and black.
+    """`ManipEnv` for lerobot-eval, which always films.
+
+    Args:
+        config: The options of the environment.
+        film: Whether to render the films; if not, their pictures are small and black.
+        cameras: The cameras that the policy observes; None for none.
+        gymnasiums: Further arguments of `ManipEnv`.
     """
 
     def __init__(
