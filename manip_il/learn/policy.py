@@ -59,8 +59,8 @@ class LearnedPolicy:
         Raises:
             UsageError: The device is a GPU, but PyTorch finds none.
             UnknownName: The type of policy is unknown.
-            ManipError: The folder is incomplete, its files do not match, or they name models to load
-                and `trust` is not given.
+            ManipError: The folder is incomplete, its files do not match, or they name models
+                to load and `trust` is not given.
         """
         require_device(device)
         opened = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint.open(checkpoint)
@@ -100,8 +100,8 @@ class LearnedPolicy:
                 and its random draws depend on that number. An episode that is not listed has ended.
 
         Returns:
-            Actions (B, n), as in the training data: usually joint targets [rad] and a gripper command
-            [m].
+            Actions (B, n), as in the training data: usually joint targets [rad] and a gripper
+            command [m].
 
         Raises:
             NotFiniteError: An action is not finite; the message names the row.
