@@ -174,15 +174,24 @@ def parse_json(what: str, data: str | bytes) -> Any:
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file. what: expected content, for the error message."""
+    """Return the object in a JSON file.
+
+    Args:
+        path: The file.
+        what: Its expected content, for the message.
+
+    Raises:
+        ManipError: The file cannot be read, or holds anything but an object.
+    """
     return mapping(str(path), parse_json(str(path), read_bytes(path, what)))
 
 
 def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text, read by the safe loader.
 
-    Raises a one-line `ValueError` if it is invalid, if it has more than 100,000 nodes after its
-    aliases are expanded, or if it holds text that is not Unicode.
+    Raises:
+        ValueError: The text is invalid or not Unicode, or it has more than 100,000 nodes after its
+            aliases are expanded. The message is one line.
     """
     import yaml  # imported here because most checks read no YAML
 
@@ -217,9 +226,14 @@ def _expanded_size(node: Any, sizes: dict[int, int]) -> int:
 
 
 def read_yaml(path: Path, what: str) -> Any:
-    """Return the value of a YAML file; `what` is the expected content.
+    """Return the value of a YAML file.
 
-    Raises `UsageError` if it cannot be read.
+    Args:
+        path: The file.
+        what: Its expected content, for the message.
+
+    Raises:
+        UsageError: The file cannot be read, or is not valid YAML.
     """
     try:
         return parse_yaml(read_bytes(path, what, UsageError, LARGEST_YAML).decode())
@@ -238,7 +252,10 @@ def open_outside(path: Path, what: str, refusal: type[ManipError] = ManipError) 
     Args:
         path: The file.
         what: Its expected content, for the message.
-        refusal: Class of the error that is raised if the file cannot be opened or is not regular.
+        refusal: The class of the error to raise.
+
+    Raises:
+        ManipError: Of the class `refusal`. The file cannot be opened or is not regular.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -257,6 +274,12 @@ def native_path(path: Path, what: str) -> Iterator[str]:
     Args:
         path: The file.
         what: Its expected content, for the message.
+
+    Yields:
+        A path that leads to the open file for as long as the block lasts.
+
+    Raises:
+        ManipError: The file cannot be opened or is not regular.
     """
     with open_outside(path, what) as file:
         yield f"/proc/self/fd/{file.fileno()}"
@@ -270,8 +293,11 @@ def read_bytes(
     Args:
         path: The file.
         what: Its expected content, for the message.
-        refusal: Class of the error that is raised if the file cannot be read or is too large.
-        most: Largest size [bytes].
+        refusal: The class of the error to raise.
+        most: The largest size that is allowed [bytes].
+
+    Raises:
+        ManipError: Of the class `refusal`. The file cannot be read or is too large.
     """
     with open_outside(path, what, refusal) as file:
         try:

@@ -41,7 +41,7 @@ class UnknownName(UsageError):
     """A name is unknown; the message lists the known names and the nearest.
 
     Args:
-        kind: What the name is of, such as `task`.
+        kind: What is named, such as `task`.
         name: The unknown name.
         known: All names that would have been accepted.
     """
@@ -77,7 +77,11 @@ class NothingToLearnError(ManipError):
 
 
 class FolderExistsError(UsageError):
-    """An output folder already exists."""
+    """An output folder already exists.
+
+    Args:
+        folder: The folder, for the message.
+    """
 
     def __init__(self, folder: object):
         ways = (

@@ -93,6 +93,13 @@ def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
 def check_bounds(options: Any, prefix: str = "") -> None:
     """Raise `UsageError` if a field of a dataclass instance has another type, or is outside its
     metadata's bounds.
+
+    Args:
+        options: The dataclass instance.
+        prefix: What stands before the fields' names in the message, such as `policy.`.
+
+    Raises:
+        UsageError: A value has the wrong type or is out of bounds.
     """
     for one in fields(options):
         value = getattr(options, one.name)

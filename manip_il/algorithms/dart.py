@@ -44,7 +44,7 @@ def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> tuple[tupl
         trust: Whether to load models that the checkpoint names, see `LearnedPolicy.load`.
 
     Returns:
-        The covariance (n, n), in products of the action's units.
+        The covariance (n, n), in the squared units of the action.
 
     Raises:
         ManipError: The dataset has no valid label, or the policy cannot be loaded.

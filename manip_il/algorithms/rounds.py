@@ -42,11 +42,17 @@ REDRAWN = "redrawn"
 
 @dataclass(frozen=True)
 class Rollouts:
-    """One round's episodes. dataset: None if the expert gave no label. beta: the expert's share of
-    the steps.
+    """One round's episodes.
 
-    labels: valid labels. queries: states in which the expert was queried. episodes, successes:
-    counts of rollouts. steps: simulated control steps.
+    Attributes:
+        round: The number of the round.
+        dataset: The folder of the training data; None if the expert gave no label.
+        beta: The expert's share of the steps.
+        labels: Number of valid labels.
+        queries: Number of states in which the expert was queried.
+        episodes: Number of rollouts.
+        successes: Number of successful rollouts.
+        steps: Simulated control steps.
     """
 
     round: int
@@ -61,11 +67,12 @@ class Rollouts:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A round's policy. members: the `pretrained_model` folders of an ensemble.
+    """A round's policy.
 
-    The first one drives.
-
-    trust: whether to load models that a checkpoint refers to.
+    Attributes:
+        round: The number of the round.
+        members: The `pretrained_model` folders of an ensemble, the first of which drives.
+        trust: Whether to load models that a checkpoint names.
     """
 
     round: int
@@ -190,7 +197,12 @@ def round_scenes(config: RunConfig, datasets: Sequence[Path]) -> Scenes:
 def begin_with(policy: Path, folder: Path) -> Path:
     """Copy a policy into the folder of a round without training data.
 
-    Return its `pretrained_model`.
+    Args:
+        policy: The `pretrained_model` folder of the policy.
+        folder: The folder of the round.
+
+    Returns:
+        The copy's `pretrained_model` folder.
     """
     last = folder / POLICY / "checkpoints" / "last"
     if not last.is_dir():

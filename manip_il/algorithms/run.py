@@ -111,9 +111,14 @@ class Run:
             merge_rounds(made, self.folder / DATASET, best.number)
 
     def demonstrations(self, count: int, round_: int = 0) -> Rollouts:
-        """Record a round with `count` successful expert episodes.
+        """Record a round of successful expert episodes.
 
-        In round 0 `config.datasets` may replace them.
+        In round 0 `config.datasets` may replace them. A round whose dataset exists is read, not run
+        again.
+
+        Args:
+            count: The number of successful episodes.
+            round_: The number of the round.
         """
         here, config = self._folder(round_), self.config
         if round_ == 0 and (config.datasets or config.start):
@@ -135,7 +140,14 @@ class Run:
         return self._made[round_]
 
     def held_out(self, count: int = 10) -> Path:
-        """Record expert episodes that no policy learns from; return their dataset."""
+        """Record expert episodes that no policy learns from.
+
+        Args:
+            count: The number of episodes.
+
+        Returns:
+            The folder of their dataset.
+        """
         root, journals = (self.folder / HELD_OUT / name for name in (DATASET, JOURNALS))
         with self._clock.timed("collect"):
             if not root.is_dir():

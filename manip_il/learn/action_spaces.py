@@ -68,10 +68,14 @@ _POSE = 6
 class Conversion:
     """Converts actions to the targets of a space and back, row by row.
 
-    robot: the arm, for `ee_delta` only. grippers: indices of the gripper openings, which are
-    absolute in `joint_delta`.
+    Attributes:
+        space: One of `ACTION_SPACES`.
+        robot: The arm, for `ee_delta` only.
+        grippers: Indices of the gripper openings, which are absolute in `joint_delta`.
 
-    Raises `UnknownName` for an unknown robot, `UsageError` for an arm with fewer than six joints.
+    Raises:
+        UnknownName: The robot is unknown.
+        UsageError: The arm has fewer than six joints.
     """
 
     space: str = JOINT_TARGET

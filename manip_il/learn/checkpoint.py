@@ -59,10 +59,24 @@ class Origin:
     """Content of `manip_il.json`: a policy's robot and task, its training data, and the options of
     its fit.
 
-    observation: one of `OBSERVATIONS`. cameras, image_size: those of its training pictures, if any;
-    look: the lighting of these pictures, as arguments of `sim.look.Look`, None if unknown.
-    datasets: name, frames and weight of each. action_space: the space that it learnt in, None for a
-    checkpoint older than this field.
+    Attributes:
+        robot: The robot's name.
+        task: The task's name.
+        fps: The control rate [Hz], as in `EnvironmentSpec`.
+        joint_names: Names of the numbers of the joint state and the action.
+        environment_state_names: Names of the numbers of the environment state.
+        action_meaning: As in `EnvironmentSpec`.
+        fingerprint: The fingerprint of the training data.
+        options: The options of the fit.
+        observation: One of `OBSERVATIONS`.
+        cameras: The cameras of the training pictures, if any.
+        image_size: The height and width of the training pictures [pixels], if any.
+        look: The lighting of the training pictures, as arguments of `sim.look.Look`; None if
+            unknown.
+        datasets: Name, frames and weight of each dataset.
+        action_space: The space that the policy learnt in; None for a checkpoint older than this
+            field.
+        object: As in `EnvironmentSpec`.
     """
 
     robot: str
@@ -152,12 +166,19 @@ def read_origin(path: Path) -> Origin | None:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A policy on disk. path: its `pretrained_model` folder. config: its `config.json`.
+    """A policy on disk.
 
-    numbers: numeric input column -> size; pictures: camera -> (height, width) [pixels]; action:
-    size of the action. space: the action space that the policy learnt in; robot: the arm, for
-    `ee_delta` only; grippers: see `Conversion`. origin: None if another program wrote the folder.
-    processors: file -> steps, each with `registry_name` and `config`.
+    Attributes:
+        path: The policy's `pretrained_model` folder.
+        config: The content of its `config.json`.
+        numbers: Size of each numeric input by column.
+        pictures: Height and width of the pictures by camera [pixels].
+        action: Size of the action.
+        space: The action space that the policy learnt in.
+        robot: The arm, for `ee_delta` only.
+        grippers: See `Conversion`.
+        origin: The content of `manip_il.json`; None if another program wrote the folder.
+        processors: The steps of each processor's file, with `registry_name` and `config`.
     """
 
     path: Path
@@ -426,8 +447,14 @@ def find_policy(path: Path) -> Path:
 
 
 def hub_hint(path: Path, kind: str = "") -> str:
-    """Return how to pull `path` if it looks like a Hub repository, else "". kind: `datasets/`
-    for a dataset.
+    """Return how to pull a path that looks like a Hub repository.
+
+    Args:
+        path: The path that was not found.
+        kind: `datasets/` for a dataset.
+
+    Returns:
+        The end of a message, or "" if the path does not look like a Hub repository.
     """
     if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
         return ""

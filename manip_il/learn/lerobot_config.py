@@ -60,9 +60,13 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
     """Return the policy configuration of a fit: new, or that of the initial checkpoint with
     changes.
 
-    The device is the GPU if there is one. Raises `UnknownName` for an unknown type or option,
-    `UsageError` for a value that LeRobot refuses, `ManipError` if it names models that are not
-    trusted.
+    The device is the GPU if there is one.
+
+    Raises:
+        UnknownName: The policy's type or an option is unknown.
+        UsageError: LeRobot refuses a value, PyTorch does not find the device, or the initial
+            checkpoint needs its dataset of states again.
+        ManipError: The policy names models that are not trusted.
     """
     cls = policy_class(fit.kind)
     source, saved = f"--policy.type={fit.kind}", dict[str, Any]()
@@ -89,7 +93,7 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
 
 
 def choice(base: type[Any], settings: Mapping[str, Any], group: str) -> Any:
-    """Return the configuration of an optimiser, a schedule or another thing with types.
+    """Return the optimiser, schedule or other configuration that `settings` describes.
 
     Args:
         base: LeRobot's base class, with which the types are registered.

@@ -45,7 +45,7 @@ class LearnedPolicy:
         *,
         trust: bool = False,
     ) -> LearnedPolicy:
-        """Load any LeRobot checkpoint, from JSON and safetensors alone unless `trust`.
+        """Load any LeRobot checkpoint, only from JSON and safetensors unless `trust` is set.
 
         The mlp is loaded without LeRobot, whose import takes seconds; other policies by LeRobot's
         own factory.
@@ -59,8 +59,8 @@ class LearnedPolicy:
         Raises:
             UsageError: The device is a GPU, but PyTorch finds none.
             UnknownName: The type of policy is unknown.
-            ManipError: The folder is incomplete, its files do not match, or they name models
-                to load and `trust` is not given.
+            ManipError: The folder is incomplete, its files do not match, or they name models to
+                load and `trust` is not set.
         """
         require_device(device)
         opened = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint.open(checkpoint)
@@ -123,8 +123,9 @@ class LearnedPolicy:
     def begin(self, instructions: Mapping[int, str]) -> None:
         """Reset the memory of episodes that begin.
 
-        instructions: episode number -> text for a policy that reads language; "" means the `task`
-        given to `load`.
+        Args:
+            instructions: For each episode's number, the text for a policy that reads language; ""
+                means the `task` given to `load`.
         """
         self._policy.begin(instructions)
 
@@ -152,11 +153,15 @@ class LearnedPolicy:
 def actions_along(
     policy: LearnedPolicy, table: Mapping[str, NDArray[Any]]
 ) -> Iterator[tuple[I64, F64]]:
-    """Yield row numbers (B,) and a policy's actions (B, n) for each time step of whole recorded
-    episodes.
+    """Yield a policy's actions for each time step of whole recorded episodes.
 
-    table: columns `observation.state`, `observation.environment_state` and `episode_index`, one
-    episode after another.
+    Args:
+        policy: The policy, which must take no pictures.
+        table: The columns `observation.state` (N, n), `observation.environment_state` (N, k) and
+            `episode_index` (N,) or (N, 1), one episode after another.
+
+    Yields:
+        For each time step, the row numbers (B,) of its frames in the table, and the actions (B, n).
     """
     episodes = table[EPISODE_INDEX].reshape(-1)
     _, lengths = np.unique(episodes, return_counts=True)

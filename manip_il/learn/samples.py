@@ -34,11 +34,12 @@ _MAX_HELD_OUT = 1_024  # number of validation samples
 
 @dataclass(frozen=True)
 class Windows:
-    """The frames that each sample consists of. episodes: the episode of every frame, (N,),
-    ascending.
+    """The frames that each sample consists of.
 
-    deltas: column -> offsets from the sample's own frame, (K,); other columns have only the
-    sample's own frame.
+    Attributes:
+        episodes: The episode of every frame, (N,), ascending.
+        deltas: Offsets from the sample's own frame, (K,), by column; other columns have only the
+            sample's own frame.
     """
 
     episodes: I64
@@ -54,10 +55,15 @@ class Windows:
         return np.searchsorted(self.episodes, self.episodes, side="right") - 1
 
     def rows(self, samples: I64, key: str) -> tuple[I64, Batch]:
-        """Return the row numbers of a column's windows, (B, K), and `<column>_is_pad` -> its
-        padding mask, (B, K).
+        """Return the row numbers of a column's windows.
 
-        For a column without a window, return `samples` themselves, (B,), and no mask.
+        Args:
+            samples: The samples' own rows, (B,).
+            key: The column.
+
+        Returns:
+            The row numbers, (B, K), and the padding mask, (B, K), under the name `<column>_is_pad`.
+            For a column without a window, `samples` themselves, (B,), and no mask.
         """
         if key not in self.deltas:
             return samples, {}
@@ -68,8 +74,13 @@ class Windows:
     def usable(self, valid: NDArray[np.bool_], drop_last: int = 0) -> I64:
         """Return the samples to train on, (S,): those with valid labels in the whole window.
 
-        valid: whether each frame's label is valid, (N,). drop_last: number of unused frames at the
-        end of each episode, LeRobot's `drop_n_last_frames`. Raises `ManipError` if nothing is left.
+        Args:
+            valid: Whether each frame's label is valid, (N,).
+            drop_last: Number of unused frames at the end of each episode, LeRobot's
+                `drop_n_last_frames`.
+
+        Raises:
+            ManipError: Nothing is left.
         """
         samples = np.flatnonzero(np.arange(len(valid)) + drop_last <= self._last)
         sound = valid[self.rows(samples, ACTION)[0]]
@@ -101,9 +112,13 @@ def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) 
 class Samples:
     """Samples in memory; a batch is one gather per column.
 
-    columns: numeric columns, (N, d) or (N,), by LeRobot's names. pictures: camera column -> uint8
-    (N, 3, H, W). tasks: text of every `task_index`, (M,). train, held_out: rows of the samples to
-    train on and to validate with, (S,) each.
+    Attributes:
+        windows: The frames that each sample consists of.
+        columns: Numeric columns, (N, d) or (N,), by LeRobot's names.
+        pictures: Pictures uint8 (N, 3, H, W) by camera column.
+        tasks: The text of every `task_index`, (M,).
+        train: Rows of the samples to train on, (S,).
+        held_out: Rows of the samples to validate with, (S,).
     """
 
     windows: Windows
