@@ -164,7 +164,12 @@ def mapping(what: str, value: object) -> dict[str, Any]:
 def parse_json(what: str, data: str | bytes) -> Any:
     """Return the value of a JSON text, None for NaN and Infinity.
 
-    Raises `ManipError` if it is invalid or too deep.
+    Args:
+        what: The name of the text, for the message.
+        data: The text.
+
+    Raises:
+        ManipError: The text is invalid, or its values are nested too deeply.
     """
     try:
         return json.loads(data, parse_constant=lambda constant: None)
@@ -325,7 +330,15 @@ def _first_bytes(path: Path) -> bytes:
 def without_link(path: str, flags: int) -> int:
     """Open a file for writing, as an `opener` for `open`.
 
-    Raises `OSError` for a link, which could lead to any file.
+    Args:
+        path: The file.
+        flags: As `open` gives them.
+
+    Returns:
+        The descriptor of the file.
+
+    Raises:
+        OSError: The path is a link, which could lead to any file, or the file cannot be opened.
     """
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 

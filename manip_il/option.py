@@ -148,7 +148,12 @@ def _is_of(value: Any, kind: Any) -> bool:
 def make_options[T](cls: type[T], **options: Any) -> T:
     """Return an instance of a dataclass of options.
 
-    Raises `UnknownName` for an option that it does not have.
+    Args:
+        cls: The dataclass.
+        options: Values of its fields by name.
+
+    Raises:
+        UnknownName: The dataclass does not have such an option.
     """
     known = [one.name for one in fields(typing.cast(Any, cls))]
     for name in options:

@@ -31,10 +31,14 @@ MAX_SEED = 1_000
 
 
 def stream_base(stream: str, seed: int = 0) -> int:
-    """Return the first seed of a named stream (`demonstrations`, `training`, `validation`, `test`,
-    `round/3`).
+    """Return the first seed of a named stream.
 
-    Raises `UsageError` for a `seed` outside [0, 1000].
+    Args:
+        stream: `demonstrations`, `training`, `validation`, `test`, `round/3`, ...
+        seed: The user's `--seed`, 0 to `MAX_SEED`.
+
+    Raises:
+        UsageError: The seed is out of range.
     """
     if not 0 <= seed <= MAX_SEED:
         raise UsageError(f"seed is {seed}; expected a whole number from 0 to {MAX_SEED}")

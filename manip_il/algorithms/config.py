@@ -35,7 +35,11 @@ class BetaSchedule:
 
     @classmethod
     def parse(cls, text: str) -> BetaSchedule:
-        """Parse `kind:parameter`, as written by `str`. Raises `UsageError` for anything else."""
+        """Parse `kind:parameter`, as written by `str`.
+
+        Raises:
+            UsageError: The text is anything else.
+        """
         kind, _, parameter = text.partition(":")
         try:
             number = float(parameter)
@@ -245,8 +249,8 @@ def plan_of(fit: FitConfig) -> tuple[int, int]:
     """Return how many actions a policy plans at once, and how many frames at an episode's end its
     fit skips.
 
-    Raises what `lerobot_options` raises, and imports LeRobot, as that constructs its
-    configurations.
+    It imports LeRobot, which constructs its configurations, and raises what `lerobot_options`
+    raises.
     """
     from manip_il.learn.lerobot_config import lerobot_options
 

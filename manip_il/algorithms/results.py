@@ -68,7 +68,11 @@ class Result:
 
     @property
     def validation(self) -> EvalResult:
-        """Validation result. Raises `ManipError` if the policy was not validated."""
+        """Validation result.
+
+        Raises:
+            ManipError: The policy was not validated.
+        """
         if self.validated is None:
             raise ManipError(f"{self.unit} {self.number} was not validated")
         return self.validated

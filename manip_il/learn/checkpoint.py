@@ -155,7 +155,8 @@ def read_origin(path: Path) -> Origin | None:
     """Return the origin in a `pretrained_model` folder, or None if another tool (lerobot-train)
     wrote it.
 
-    Raises `ManipError` for a file that is incomplete or not ours.
+    Raises:
+        ManipError: The file is incomplete or not ours.
     """
     file = Path(path) / META_FILE
     if not file.is_file():
@@ -200,8 +201,8 @@ class Checkpoint:
     def open(cls, path: Path) -> Checkpoint:
         """Read and check the files of a folder, except its weights.
 
-        Raises `ManipError` if the folder is incomplete or gives a processor's step by an import
-        path.
+        Raises:
+            ManipError: The folder is incomplete, or gives a processor's step by an import path.
         """
         path = Path(path)
         config, origin = read_config(path), read_origin(path)
@@ -271,8 +272,10 @@ class Checkpoint:
     def cameras(self) -> CameraConfig | None:
         """Cameras, picture size and lighting as in training; None if the policy takes no pictures.
 
-        The lighting is the default if the checkpoint has none. Raises `UsageError` for cameras that
-        environments do not have, and for an invalid size.
+        The lighting is the default if the checkpoint has none.
+
+        Raises:
+            UsageError: Environments do not have the cameras, or the size is invalid.
         """
         if not self.pictures:
             return None
@@ -394,7 +397,11 @@ def require_trust(
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Return the `config.json` of a folder. Raises `ManipError` if the folder is incomplete."""
+    """Return the `config.json` of a folder.
+
+    Raises:
+        ManipError: The folder is incomplete.
+    """
     config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json")
     if not (path / WEIGHTS).is_file():
         raise ManipError(f"no {WEIGHTS} in {path}: the weights are missing")
@@ -408,8 +415,9 @@ def read_config(path: Path) -> dict[str, Any]:
 def processor_steps(path: Path) -> list[dict[str, Any]]:
     """Return the steps in a processor's file, each with `registry_name` and `config`.
 
-    Refuses steps given by import path, because LeRobot would import and call whatever a downloaded
-    file names.
+    Raises:
+        ManipError: The file cannot be read, or gives a step by an import path: LeRobot would import
+            and call whatever a downloaded file names.
     """
     values = checks.read_json(path, "a processor of LeRobot's")
     with in_one_line(f"{path} cannot be read"):
@@ -434,7 +442,8 @@ def find_policy(path: Path) -> Path:
     """Return `path` if it is a `pretrained_model` folder, else the best or newest one in this
     checkpoint or run.
 
-    Raises `UsageError` if there is none.
+    Raises:
+        UsageError: There is no policy.
     """
     for place in _PLACES:
         if (path / place / "config.json").is_file():

@@ -131,7 +131,11 @@ class FitConfig:
 
     @cached_property
     def start(self) -> Checkpoint | None:
-        """The checkpoint in `policy.path`. Raises `ManipError` if it cannot be read."""
+        """The checkpoint in `policy.path`.
+
+        Raises:
+            ManipError: The checkpoint cannot be read.
+        """
         return _open(Path(self.policy["path"])) if "path" in self.policy else None
 
     @cached_property

@@ -44,7 +44,11 @@ def policy_types() -> tuple[str, ...]:
 
 
 def policy_class(kind: str) -> type[PreTrainedConfig]:
-    """Return the configuration class of a policy type. Raises `UnknownName` for an unknown type."""
+    """Return the configuration class of a policy type.
+
+    Raises:
+        UnknownName: The type is unknown.
+    """
     policy_types()
     return _registered(PreTrainedConfig, kind, "policy")
 

@@ -26,7 +26,12 @@ _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class Head:
-    """A family of action distributions. n: numbers in an action. size: parameters per row."""
+    """A family of action distributions.
+
+    Attributes:
+        n: Numbers in an action.
+        size: Parameters per row.
+    """
 
     n: int
     size: int

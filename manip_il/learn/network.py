@@ -300,7 +300,8 @@ def require_device(device: str) -> None:
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
     """Return weights (n, d) and statistics (n,) by name from a folder.
 
-    `ManipError` if they cannot be read.
+    Raises:
+        ManipError: They cannot be read.
     """
     path = Path(pretrained_model) / WEIGHTS
     with in_one_line(f"{path} cannot be read"), native_path(path, "weights") as opened:
@@ -316,8 +317,14 @@ def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
     The input statistics stay those of the new data: the first layer compensates for the difference.
     (An input normaliser frozen at the first round of DAgger puts later rounds' states out of
     scale.) The range of the targets is also that of the new data; their mean and scale are copied,
-    as they are only the unit of the outputs. Raises `ManipError` for a file that cannot be read or
-    does not fit.
+    as they are only the unit of the outputs.
+
+    Args:
+        network: The network, which has the statistics of the new data.
+        pretrained_model: The folder of the policy to start from.
+
+    Raises:
+        ManipError: The weights cannot be read or do not fit.
     """
     of_new_data = ("input_mean", "input_scale", "target_low", "target_high")
     kept = {name: getattr(network, name).clone() for name in of_new_data}

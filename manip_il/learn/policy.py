@@ -158,7 +158,7 @@ def actions_along(
     Args:
         policy: The policy, which must take no pictures.
         table: The columns `observation.state` (N, n), `observation.environment_state` (N, k) and
-            `episode_index` (N,) or (N, 1), one episode after another.
+            `episode_index` (N,) or (N, 1), ascending.
 
     Yields:
         For each time step, the row numbers (B,) of its frames in the table, and the actions (B, n).

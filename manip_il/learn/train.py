@@ -271,7 +271,8 @@ class Trainer:
     def take_step(self, metrics: MetricsTracker) -> None:
         """Take one gradient step, which `metrics` counts.
 
-        Raises `NotFiniteError` if the loss is not finite.
+        Raises:
+            NotFiniteError: The loss is not finite.
         """
         update_policy(
             metrics,
