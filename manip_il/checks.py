@@ -95,7 +95,16 @@ def repo_id(what: str, value: object) -> str:
 
 
 def text(what: str, value: object, longest: int = LONGEST_TEXT) -> str:
-    """Return a string of at most `longest` characters, all of them Unicode."""
+    """Return a string of at most `longest` characters, all of them Unicode.
+
+    Args:
+        what: The name of the value, for the message.
+        value: The value to check.
+        longest: The greatest length [characters].
+
+    Raises:
+        ManipError: The value is not a string, is too long, or holds a lone surrogate.
+    """
     if not isinstance(value, str) or len(value) > longest or _SURROGATE.search(value):
         raise ManipError(
             f"{what} is {shorten(value)}; expected text of at most {longest} characters, in Unicode"
@@ -104,7 +113,17 @@ def text(what: str, value: object, longest: int = LONGEST_TEXT) -> str:
 
 
 def whole(what: str, value: object, low: int, high: int) -> int:
-    """Return an int within [low, high]; True and 3.0 are rejected."""
+    """Return an int within [low, high].
+
+    Args:
+        what: The name of the value, for the message.
+        value: The value to check.
+        low: The least number that is allowed.
+        high: The greatest number that is allowed.
+
+    Raises:
+        ManipError: The value is outside the limits or not an int; True and 3.0 are rejected.
+    """
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise ManipError(
             f"{what} is {shorten(value)}; expected a whole number from {low} to {high}"
@@ -113,7 +132,17 @@ def whole(what: str, value: object, low: int, high: int) -> int:
 
 
 def number(what: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
-    """Return a finite float within [low, high]."""
+    """Return a finite float within [low, high].
+
+    Args:
+        what: The name of the value, for the message.
+        value: The value to check, an int or a float.
+        low: The least number that is allowed.
+        high: The greatest number that is allowed.
+
+    Raises:
+        ManipError: The value is outside the limits, not finite or not a number.
+    """
     most = sys.float_info.max  # a larger int does not fit in a float
     if (
         isinstance(value, int | float)
@@ -135,7 +164,12 @@ def mapping(what: str, value: object) -> dict[str, Any]:
 def parse_json(what: str, data: str | bytes) -> Any:
     """Return the value of a JSON text, None for NaN and Infinity.
 
-    Raises `ManipError` if it is invalid or too deep.
+    Args:
+        what: The name of the text, for the message.
+        data: The text.
+
+    Raises:
+        ManipError: The text is invalid, or its values are nested too deeply.
     """
     try:
         return json.loads(data, parse_constant=lambda constant: None)
@@ -145,15 +179,24 @@ def parse_json(what: str, data: str | bytes) -> Any:
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file. what: expected content, for the error message."""
+    """Return the object in a JSON file.
+
+    Args:
+        path: The file.
+        what: Its expected content, for the message.
+
+    Raises:
+        ManipError: The file cannot be read, or holds anything but an object.
+    """
     return mapping(str(path), parse_json(str(path), read_bytes(path, what)))
 
 
 def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text, read by the safe loader.
 
-    Raises a one-line `ValueError` if it is invalid, if it has more than 100,000 nodes after its
-    aliases are expanded, or if it holds text that is not Unicode.
+    Raises:
+        ValueError: The text is invalid or not Unicode, or it has more than 100,000 nodes after its
+            aliases are expanded. The message is one line.
     """
     import yaml  # imported here because most checks read no YAML
 
@@ -188,9 +231,14 @@ def _expanded_size(node: Any, sizes: dict[int, int]) -> int:
 
 
 def read_yaml(path: Path, what: str) -> Any:
-    """Return the value of a YAML file; `what` is the expected content.
+    """Return the value of a YAML file.
 
-    Raises `UsageError` if it cannot be read.
+    Args:
+        path: The file.
+        what: Its expected content, for the message.
+
+    Raises:
+        UsageError: The file cannot be read, or is not valid YAML.
     """
     try:
         return parse_yaml(read_bytes(path, what, UsageError, LARGEST_YAML).decode())
@@ -209,7 +257,10 @@ def open_outside(path: Path, what: str, refusal: type[ManipError] = ManipError) 
     Args:
         path: The file.
         what: Its expected content, for the message.
-        refusal: Class of the error that is raised if the file cannot be opened or is not regular.
+        refusal: The class of the error to raise.
+
+    Raises:
+        ManipError: Of the class `refusal`. The file cannot be opened or is not regular.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -228,6 +279,12 @@ def native_path(path: Path, what: str) -> Iterator[str]:
     Args:
         path: The file.
         what: Its expected content, for the message.
+
+    Yields:
+        A path that leads to the open file for as long as the block lasts.
+
+    Raises:
+        ManipError: The file cannot be opened or is not regular.
     """
     with open_outside(path, what) as file:
         yield f"/proc/self/fd/{file.fileno()}"
@@ -241,8 +298,11 @@ def read_bytes(
     Args:
         path: The file.
         what: Its expected content, for the message.
-        refusal: Class of the error that is raised if the file cannot be read or is too large.
-        most: Largest size [bytes].
+        refusal: The class of the error to raise.
+        most: The largest size that is allowed [bytes].
+
+    Raises:
+        ManipError: Of the class `refusal`. The file cannot be read or is too large.
     """
     with open_outside(path, what, refusal) as file:
         try:
@@ -270,7 +330,15 @@ def _first_bytes(path: Path) -> bytes:
 def without_link(path: str, flags: int) -> int:
     """Open a file for writing, as an `opener` for `open`.
 
-    Raises `OSError` for a link, which could lead to any file.
+    Args:
+        path: The file.
+        flags: As `open` gives them.
+
+    Returns:
+        The descriptor of the file.
+
+    Raises:
+        OSError: The path is a link, which could lead to any file, or the file cannot be opened.
     """
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
@@ -281,11 +349,20 @@ def in_child(
     *arguments: object,
     seconds: float = SECONDS_IN_CHILD,
 ) -> None:
-    """Call `function(*arguments)` in a child process, limited to 4 GB of memory and `seconds` [s].
+    """Call a function in a child process with limited memory (4 GB) and time.
 
-    Only the text of a `ManipError` comes back, because the file is untrusted. Raises a `ManipError`
-    with that text, and one if the child exceeds its limits or dies. what: name of the file or
-    folder, for these messages; a function that opens several files calls `opening` before each.
+    Only the text of a `ManipError` comes back, because the file is untrusted.
+
+    Args:
+        what: The name of the file or folder, for the messages. A function that opens several files
+            calls `opening` before each.
+        function: The function to call; it and its arguments are pickled.
+        arguments: The arguments of the function.
+        seconds: The time limit [s].
+
+    Raises:
+        ManipError: The function raised one, whose text this one has; or the child exceeded its
+            limits or died.
     """
     command = [sys.executable, "-c", "from manip_il.checks import answer_parent; answer_parent()"]
     done = subprocess.run(

@@ -38,7 +38,13 @@ class UsageError(ManipError):
 
 
 class UnknownName(UsageError):
-    """A name is unknown; the message lists the known names and the nearest."""
+    """A name is unknown; the message lists the known names and the nearest.
+
+    Args:
+        kind: What is named, such as `task`.
+        name: The unknown name.
+        known: All names that would have been accepted.
+    """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]):
         known = sorted(known)
@@ -48,7 +54,15 @@ class UnknownName(UsageError):
 
 
 class MismatchError(ManipError):
-    """Two things that must agree (dataset, policy, environment) differ; the message names both."""
+    """Two things that must agree (dataset, policy, environment) differ; the message names both.
+
+    Args:
+        what: The property in which they differ.
+        left: The name of one thing.
+        left_value: Its value of the property.
+        right: The name of the other thing.
+        right_value: The other thing's value of the property.
+    """
 
     def __init__(self, what: str, left: str, left_value: object, right: str, right_value: object):
         super().__init__(f"{what} differs: {left} has {left_value}, {right} has {right_value}")
@@ -63,7 +77,11 @@ class NothingToLearnError(ManipError):
 
 
 class FolderExistsError(UsageError):
-    """An output folder already exists."""
+    """An output folder already exists.
+
+    Args:
+        folder: The folder, for the message.
+    """
 
     def __init__(self, folder: object):
         ways = (
@@ -78,8 +96,15 @@ class RenderError(ManipError):
 
 
 def nearest(name: str, known: Iterable[str], most: int = 1) -> str:
-    """Return ` (did you mean 'x' or 'y'?)` with at most `most` known names like `name`, or "" if
-    none is near.
+    """Return a hint at the known names that are most like a name.
+
+    Args:
+        name: The unknown name.
+        known: The known names.
+        most: The greatest number of names in the hint.
+
+    Returns:
+        ` (did you mean 'x' or 'y'?)`, or "" if no known name is near.
     """
     near = difflib.get_close_matches(name, list(known), most)
     return f" (did you mean {' or '.join(map(repr, near))}?)" if near else ""

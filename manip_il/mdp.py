@@ -38,12 +38,17 @@ class Actor(IntEnum):
 class State:
     """The full, privileged state: enough to restore the simulator exactly.
 
-    physics: MuJoCo's integration state, (p,), including goals and fixed furniture as mocap poses.
-    variation: every model parameter that was drawn for the episode, (v,). step: control steps since
-    reset. streak: consecutive control steps within the tolerance. ever: whether the episode has
-    succeeded at some step. seed: of the episode, which decides the noise and knocks of its later
-    steps; None in a state that was read from a dataset, whose `seed` column has it. begun: whether
-    the knock of the control step that follows, if there is one, has happened already.
+    Attributes:
+        physics: MuJoCo's integration state, (p,), including goals and fixed furniture as mocap
+            poses.
+        variation: Every model parameter that was drawn for the episode, (v,).
+        step: Control steps since the reset.
+        streak: Consecutive control steps within the tolerance.
+        ever: Whether the episode has succeeded at some step.
+        seed: The episode's seed, which decides the noise and knocks of its later steps. None in a
+            state that was read from a dataset, whose `seed` column has it.
+        begun: Whether the knock of the control step that follows, if there is one, has happened
+            already.
     """
 
     physics: F64
@@ -74,13 +79,16 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a policy observes. state: (n,).
+    """What a policy observes.
 
-    environment_state: (k,), privileged, for state-based policies.
-
-    instruction: the task in words, for policies that read language. keypoints: image coordinates of
-    named points of the scene, across and down in [0, 1], and 1 if the point is within the picture,
-    else 0; privileged.
+    Attributes:
+        state: The measured joints [rad] and gripper opening [m], (n,).
+        environment_state: Privileged, for state-based policies, (k,).
+        images: Pictures (H, W, 3) by camera.
+        instruction: The task in words, for policies that read language.
+        keypoints: Named points of the scene in each camera's picture, (K, 3), privileged. The
+            numbers are the image coordinates across and down, in [0, 1], and 1 if the point is
+            within the picture, else 0.
     """
 
     state: F32
@@ -98,9 +106,13 @@ class Observation:
 class Label:
     """The expert's label of one state.
 
-    action: joint targets [rad] and gripper command [m], (n,). phase: number of the task's phase, 0
-    for none. residual: fraction of the hand's pose error that remains after the step, in [0, 1]. If
-    `valid` is false, `reason` says why and `action` holds the arm still.
+    Attributes:
+        action: Joint targets [rad] and gripper command [m], (n,). It holds the arm still if the
+            label is not valid.
+        phase: Number of the task's phase, 0 for none.
+        valid: Whether the expert has an action in this state.
+        residual: Fraction of the hand's pose error that remains after the step, in [0, 1].
+        reason: Why the label is not valid.
     """
 
     action: F64
@@ -117,9 +129,19 @@ class Label:
 class Transition:
     """One control step of one episode: all content of a dataset's frame.
 
-    `state`, `observation` and `progress` are from before the step; `reward`, `success`, `done` from
-    after it. `success`: whether the last `success_steps` steps were all within the tolerance.
-    `done` marks the last frame.
+    Attributes:
+        seed: The episode's seed.
+        step: Control steps since the reset.
+        state: The state before the step.
+        observation: The observation before the step.
+        label: The expert's label of the state before the step; None if there is none.
+        executed_action: Joint targets [rad] and gripper command [m] of the step, (n,).
+        actor: Who drove the robot.
+        reward: The reward after the step.
+        success: Whether, after the step, the last `success_steps` steps were all within the
+            tolerance.
+        done: Whether this is the last frame of the episode.
+        progress: The task's progress before the step.
     """
 
     seed: int
@@ -140,10 +162,16 @@ class Episode:
     """A finished episode as columns, with the dataset's names (without LeRobot's own index
     columns).
 
-    columns: name -> array (T, ...). success: whether the goal was held, at some time, for the
-    required number of consecutive steps; success_at_end: whether it was so at the last frame.
-    instruction: the task in words, for policies that read language; empty for the task's own text.
-    drawn: how the episode's world differed from the nominal one: range name -> plain JSON value.
+    Attributes:
+        seed: The episode's seed.
+        columns: Arrays (T, ...) by name.
+        success: Whether the goal was held, at some time, for the required number of consecutive
+            steps.
+        success_at_end: Whether it was so at the last frame.
+        instruction: The task in words, for policies that read language; empty for the task's own
+            text.
+        drawn: How the episode's world differed from the nominal one: plain JSON values by the names
+            of the ranges.
     """
 
     seed: int
@@ -178,8 +206,14 @@ class Episode:
 
 
 def require_finite(what: str, values: NDArray[np.generic]) -> None:
-    """Raise `NotFiniteError` naming `what` and the first bad row, unless all values (T, ...) are
-    finite.
+    """Raise `NotFiniteError` unless all values are finite.
+
+    Args:
+        what: The name of the values, for the message.
+        values: Numbers (T, ...).
+
+    Raises:
+        NotFiniteError: A value is not finite; the message names the first bad row.
     """
     if values.dtype.kind != "f":
         return

@@ -30,11 +30,13 @@ def typed(text: NameOrPath) -> NameOrPath:
 
 
 def option(default: Any, help_text: str, **metadata: Any) -> Any:
-    """Return a dataclass field. default: a value, a class or function that makes one, or `MISSING`
-    for none.
+    """Return a dataclass field with a line of help.
 
-    metadata: `at_least` and `at_most` (see `check_bound`), and the keys of
-    `manip_il.cli.parsing.Option`.
+    Args:
+        default: A value, a class or function that makes one, or `MISSING` for none.
+        help_text: The help that the command line shows.
+        metadata: `at_least` and `at_most` (see `check_bound`), and the keys of
+            `manip_il.cli.parsing.Option`.
     """
     metadata = {"help": help_text, **metadata}
     if callable(default):
@@ -52,7 +54,13 @@ def keyword(default: Any, help_text: str, **metadata: Any) -> Any:
 
 
 def bounded(default: Any, low: float, high: float) -> Any:
-    """Return a dataclass field that is no option, but has the bounds of one."""
+    """Return a dataclass field that is no option, but has the bounds of one.
+
+    Args:
+        default: The default of the field.
+        low: The least value that is allowed.
+        high: The greatest value that is allowed.
+    """
     return field(default=default, metadata={"at_least": low, "at_most": high})
 
 
@@ -64,8 +72,15 @@ def option_of(cls: type, name: str) -> Any:
 
 
 def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
-    """Raise `UsageError` if a value that is not None is below `at_least` or above `at_most` in a
-    field's metadata.
+    """Raise `UsageError` if a value is outside the bounds in a field's metadata.
+
+    Args:
+        name: The name of the option, for the message.
+        value: The value to check; None is always allowed.
+        metadata: The field's metadata. `at_least` and `at_most` are the bounds, if given.
+
+    Raises:
+        UsageError: The value is below `at_least` or above `at_most`.
     """
     if value is None or not {"at_least", "at_most"} & metadata.keys():
         return
@@ -78,6 +93,13 @@ def check_bound(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
 def check_bounds(options: Any, prefix: str = "") -> None:
     """Raise `UsageError` if a field of a dataclass instance has another type, or is outside its
     metadata's bounds.
+
+    Args:
+        options: The dataclass instance.
+        prefix: What stands before the fields' names in the message, such as `policy.`.
+
+    Raises:
+        UsageError: A value has the wrong type or is out of bounds.
     """
     for one in fields(options):
         value = getattr(options, one.name)
@@ -126,7 +148,12 @@ def _is_of(value: Any, kind: Any) -> bool:
 def make_options[T](cls: type[T], **options: Any) -> T:
     """Return an instance of a dataclass of options.
 
-    Raises `UnknownName` for an option that it does not have.
+    Args:
+        cls: The dataclass.
+        options: Values of its fields by name.
+
+    Raises:
+        UnknownName: The dataclass does not have such an option.
     """
     known = [one.name for one in fields(typing.cast(Any, cls))]
     for name in options:

@@ -22,7 +22,11 @@ class Progress:
         """`n` steps of the stage are done."""
 
     def log(self, record: dict[str, Any]) -> None:
-        """A step of a fit is done. record: `step` and metrics, or {} if there are none."""
+        """A step of a fit is done.
+
+        Args:
+            record: `step` and metrics, or {} if there are none.
+        """
 
     def finished(self, result: Any) -> None:
         """A round or an iteration is done; `result` is its `Result`."""

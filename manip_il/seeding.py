@@ -31,10 +31,14 @@ MAX_SEED = 1_000
 
 
 def stream_base(stream: str, seed: int = 0) -> int:
-    """Return the first seed of a named stream (`demonstrations`, `training`, `validation`, `test`,
-    `round/3`).
+    """Return the first seed of a named stream.
 
-    Raises `UsageError` for a `seed` outside [0, 1000].
+    Args:
+        stream: `demonstrations`, `training`, `validation`, `test`, `round/3`, ...
+        seed: The user's `--seed`, 0 to `MAX_SEED`.
+
+    Raises:
+        UsageError: The seed is out of range.
     """
     if not 0 <= seed <= MAX_SEED:
         raise UsageError(f"seed is {seed}; expected a whole number from 0 to {MAX_SEED}")
@@ -42,7 +46,16 @@ def stream_base(stream: str, seed: int = 0) -> int:
 
 
 def stream_seeds(stream: str, count: int, seed: int = 0) -> range:
-    """Return the first `count` seeds of a named stream."""
+    """Return the first seeds of a named stream.
+
+    Args:
+        stream: The name, as for `stream_base`.
+        count: The number of seeds, 0 to `BLOCK`.
+        seed: The user's `--seed`, 0 to `MAX_SEED`.
+
+    Raises:
+        UsageError: The count or the seed is out of range.
+    """
     if not 0 <= count <= BLOCK:
         raise UsageError(f"{count} seeds requested from stream {stream!r}; expected 0 to {BLOCK}")
     base = stream_base(stream, seed)

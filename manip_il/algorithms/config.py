@@ -35,7 +35,11 @@ class BetaSchedule:
 
     @classmethod
     def parse(cls, text: str) -> BetaSchedule:
-        """Parse `kind:parameter`, as written by `str`. Raises `UsageError` for anything else."""
+        """Parse `kind:parameter`, as written by `str`.
+
+        Raises:
+            UsageError: The text is anything else.
+        """
         kind, _, parameter = text.partition(":")
         try:
             number = float(parameter)
@@ -84,16 +88,19 @@ _DEFAULTS = ("per_state", None, _LEARNER_ALONE)  # label, query, beta
 class RunConfig(Seeded):
     """Options of `manip-il dagger`.
 
-    Round 0 records the expert's demonstrations unless `datasets` has some.
+    Round 0 records the expert's demonstrations unless `datasets` has some. Later rounds start from
+    the weights of the policy `start`, if it is given, and keep its architecture.
 
-    datasets: recorded demonstrations that replace those of round 0. start: the `pretrained_model`
-    folder of a policy that replaces cloning in round 0; without datasets, round 0 then has no
-    demonstrations. Later rounds start from the policy's weights and keep its architecture.
-
-    query_rule: None for the label mode's default, see `query`. hold: also applies to validation.
-    patience: ends rollouts that only repeat their states. disturbed_share: the disturbances are
-    `manip_il.sim.events.STANDARD`. cameras: rendered during rollouts or, with `redraw`, only in the
-    redrawn scenes. conditions: variations of the world in rollouts and validation.
+    Attributes:
+        query_rule: When the expert is queried; None for the label mode's default, see `query`.
+        hold: Also applies to validation.
+        patience: Ends rollouts that only repeat their states.
+        disturbed_share: The disturbances are `manip_il.sim.events.STANDARD`.
+        cameras: Rendered during rollouts or, with `redraw`, only in the redrawn scenes.
+        conditions: Variations of the world in rollouts and validation.
+        datasets: Recorded demonstrations that replace those of round 0.
+        start: The `pretrained_model` folder of a policy that replaces cloning in round 0; without
+            datasets, round 0 then has no demonstrations.
     """
 
     env: EnvConfig = field(default_factory=make_config)
@@ -242,8 +249,8 @@ def plan_of(fit: FitConfig) -> tuple[int, int]:
     """Return how many actions a policy plans at once, and how many frames at an episode's end its
     fit skips.
 
-    Raises what `lerobot_options` raises, and imports LeRobot, as that constructs its
-    configurations.
+    It imports LeRobot, which constructs its configurations, and raises what `lerobot_options`
+    raises.
     """
     from manip_il.learn.lerobot_config import lerobot_options
 

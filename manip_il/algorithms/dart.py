@@ -33,12 +33,21 @@ def dart(run: Run, c: RunConfig) -> Iterator[Result]:
 
 
 def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> tuple[tuple[float, ...], ...]:
-    """Return the noise of the next round: the covariance (n, n) of the learner's errors on an
-    expert's dataset.
+    """Return the covariance of the learner's errors on an expert's dataset: the next round's noise.
 
-    The noise is the maximum likelihood fit of a Gaussian with mean zero, as in the paper. Use data
-    that the policy was not fitted to, or its errors are underestimated. trust: see
-    `LearnedPolicy.load`. Raises `ManipError` if there is no valid label.
+    It is the maximum likelihood fit of a Gaussian with mean zero, as in the paper.
+
+    Args:
+        policy: The `pretrained_model` folder of the learner.
+        root: The expert's dataset. The policy must not have been fitted to it, or its errors are
+            underestimated.
+        trust: Whether to load models that the checkpoint names, see `LearnedPolicy.load`.
+
+    Returns:
+        The covariance (n, n), in the squared units of the action.
+
+    Raises:
+        ManipError: The dataset has no valid label, or the policy cannot be loaded.
     """
     table = Dataset.open(root).columns(
         (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE_INDEX)

@@ -101,8 +101,12 @@ def run_config(
 
 
 def check_inputs(config: RunConfig) -> None:
-    """Raise `MismatchError` unless the datasets and the starting policy of a run fit its
-    environment.
+    """Check that the datasets and the starting policy of a run fit its environment.
+
+    Raises:
+        MismatchError: A dataset or the policy does not fit.
+        ManipError: A dataset has no states of the simulator or other cameras than the run, or the
+            policy cannot be read.
     """
     recorded = None if config.redraw else config.cameras
     here, run = env_spec(config.env, recorded), f"{config.env.robot} {config.env.task} of this run"

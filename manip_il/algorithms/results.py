@@ -45,9 +45,16 @@ class Result:
 
     Iteration 0 is the initial policy.
 
-    steps, episodes: simulated so far. metrics: of the method, such as `labels`, the valid labels
-    learnt from so far. policy: the checkpoint. validated: None if no validation was due. seconds:
-    by stage; 0 for stages that were already on disk.
+    Attributes:
+        unit: What was finished.
+        number: Its number.
+        steps: Control steps simulated so far.
+        episodes: Episodes simulated so far.
+        metrics: Metrics of the method by name, such as `labels`, the valid labels learnt from so
+            far.
+        policy: The checkpoint.
+        validated: The validation; None if none was due.
+        seconds: Time by stage [s]; 0 for stages that were already on disk.
     """
 
     unit: Literal["round", "iteration"]
@@ -61,7 +68,11 @@ class Result:
 
     @property
     def validation(self) -> EvalResult:
-        """Validation result. Raises `ManipError` if the policy was not validated."""
+        """Validation result.
+
+        Raises:
+            ManipError: The policy was not validated.
+        """
         if self.validated is None:
             raise ManipError(f"{self.unit} {self.number} was not validated")
         return self.validated

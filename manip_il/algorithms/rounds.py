@@ -42,11 +42,17 @@ REDRAWN = "redrawn"
 
 @dataclass(frozen=True)
 class Rollouts:
-    """One round's episodes. dataset: None if the expert gave no label. beta: the expert's share of
-    the steps.
+    """One round's episodes.
 
-    labels: valid labels. queries: states in which the expert was queried. episodes, successes:
-    counts of rollouts. steps: simulated control steps.
+    Attributes:
+        round: The number of the round.
+        dataset: The folder of the training data; None if the expert gave no label.
+        beta: The expert's share of the steps.
+        labels: Number of valid labels.
+        queries: Number of states in which the expert was queried.
+        episodes: Number of rollouts.
+        successes: Number of successful rollouts.
+        steps: Simulated control steps.
     """
 
     round: int
@@ -61,11 +67,12 @@ class Rollouts:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A round's policy. members: the `pretrained_model` folders of an ensemble.
+    """A round's policy.
 
-    The first one drives.
-
-    trust: whether to load models that a checkpoint refers to.
+    Attributes:
+        round: The number of the round.
+        members: The `pretrained_model` folders of an ensemble, the first of which drives.
+        trust: Whether to load models that a checkpoint names.
     """
 
     round: int
@@ -100,7 +107,16 @@ def expert_job(config: RunConfig, round_: int) -> RolloutJob:
 def record_round(
     folder: Path, job: RolloutJob, episodes: Iterator[tuple[Journal, Episode]], recording: Recording
 ) -> None:
-    """Run a round's episodes in its folder, and write their dataset."""
+    """Run a round's episodes in its folder, and write their dataset.
+
+    If the expert was never queried, no dataset is written.
+
+    Args:
+        folder: The folder of the round.
+        job: The job of the rollouts.
+        episodes: The journal and the episode of each rollout; iterating over it runs the rollouts.
+        recording: How the dataset is made from the rollouts.
+    """
     for line in journal_of(folder / JOURNALS, job).prepare():
         _LOG.warning("%s", line)
     try:
@@ -111,8 +127,14 @@ def record_round(
 
 
 def read_rollouts(folder: Path, round_: int, beta: float, *, queried_everywhere: bool) -> Rollouts:
-    """Return a round's rollouts as found on disk. queried_everywhere: whether the expert was
-    queried in every state.
+    """Return a round's rollouts as found on disk.
+
+    Args:
+        folder: The folder of the round.
+        round_: The number of the round.
+        beta: The share of the steps that the expert drove.
+        queried_everywhere: Whether the expert was queried in every state; if not, every label
+            counts as a query.
     """
     episodes = (read_journal(path)[1] for path in list_episodes(folder / JOURNALS))
     ends = [(len(episode), episode.success) for episode in episodes]
@@ -139,8 +161,12 @@ def given_rollouts(folder: Path, datasets: Sequence[Path]) -> Rollouts:
 
 
 def merge_rounds(datasets: Sequence[Path], root: Path, best: int) -> None:
-    """Write all rounds' labels as one dataset, unless it exists. best: number of the best round,
-    for the provenance.
+    """Write all rounds' labels as one dataset, unless it exists.
+
+    Args:
+        datasets: The datasets of the rounds; if there are none, nothing is written.
+        root: The folder of the merged dataset.
+        best: The number of the best round, for the provenance.
     """
 
     def episodes(dataset: Path) -> int:
@@ -171,7 +197,12 @@ def round_scenes(config: RunConfig, datasets: Sequence[Path]) -> Scenes:
 def begin_with(policy: Path, folder: Path) -> Path:
     """Copy a policy into the folder of a round without training data.
 
-    Return its `pretrained_model`.
+    Args:
+        policy: The `pretrained_model` folder of the policy.
+        folder: The folder of the round.
+
+    Returns:
+        The copy's `pretrained_model` folder.
     """
     last = folder / POLICY / "checkpoints" / "last"
     if not last.is_dir():
@@ -189,19 +220,28 @@ def fit_round(
 ) -> Path:
     """Fit a round's policy to datasets, or resume the fit.
 
-    Return the checkpoint's `pretrained_model`.
+    Args:
+        roots: The folders of the datasets.
+        folder: The folder of the round.
+        fit: The options of the fit.
+        member: The policy's index in the ensemble.
+        on_log: Called after each step with its metrics, or with {} if there are none.
 
-    member: index in the ensemble. on_log: called with each step's metrics, {} if there are none.
+    Returns:
+        The last checkpoint's `pretrained_model` folder.
     """
     into = folder / (f"{POLICY}_{member}" if member else POLICY)
     return Trainer([*map(Dataset.open, roots)], fit, into, resume=True).fit(on_log)
 
 
 def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0) -> FitConfig:
-    """Return the options of one round's fit. init_from: policy from which a warm fit starts.
+    """Return the options of one round's fit.
 
-    If None, the fit starts from the run's start policy, if any. member: index in the ensemble; each
-    member has its own seed.
+    Args:
+        config: The options of the run.
+        init_from: The policy from which a warm fit starts. If None, the fit starts from the run's
+            start policy, if there is one.
+        member: The policy's index in the ensemble; each member has its own seed.
     """
     steps = config.fit.steps or (CHUNK_STEPS if config.fit.defaults is LEROBOT else None)
     if init_from is not None:

@@ -62,7 +62,12 @@ HELD_OUT = "held_out"
 class Run:
     """A run's folder, its workers, and its results so far.
 
-    config: a `RunConfig`, or, in the subclass of `manip_il.chapter.learning`, a `LearningConfig`.
+    Args:
+        config: A `RunConfig`, or, in the subclass of `manip_il.chapter.learning`, a
+            `LearningConfig`.
+        folder: The folder of the run.
+        engine: The workers that simulate the episodes.
+        progress: Follows the run.
     """
 
     def __init__(self, config: Any, folder: Path, engine: Engine, progress: Progress | None = None):
@@ -106,9 +111,14 @@ class Run:
             merge_rounds(made, self.folder / DATASET, best.number)
 
     def demonstrations(self, count: int, round_: int = 0) -> Rollouts:
-        """Record a round with `count` successful expert episodes.
+        """Record a round of successful expert episodes.
 
-        In round 0 `config.datasets` may replace them.
+        In round 0 `config.datasets` may replace them. A round whose dataset exists is read, not run
+        again.
+
+        Args:
+            count: The number of successful episodes.
+            round_: The number of the round.
         """
         here, config = self._folder(round_), self.config
         if round_ == 0 and (config.datasets or config.start):
@@ -130,7 +140,14 @@ class Run:
         return self._made[round_]
 
     def held_out(self, count: int = 10) -> Path:
-        """Record expert episodes that no policy learns from; return their dataset."""
+        """Record expert episodes that no policy learns from.
+
+        Args:
+            count: The number of episodes.
+
+        Returns:
+            The folder of their dataset.
+        """
         root, journals = (self.folder / HELD_OUT / name for name in (DATASET, JOURNALS))
         with self._clock.timed("collect"):
             if not root.is_dir():
@@ -149,11 +166,16 @@ class Run:
     def rollouts(
         self, round_: int, driver: Driver, query: Query | None = None, disturbed: float = 0.0
     ) -> Rollouts:
-        """Record a round's episodes, successful or not, with the expert's labels in the mode
-        `config.label`.
+        """Record a round's episodes, successful or not, labelled in the mode `config.label`.
 
-        query: when the expert is queried; None: in every state. disturbed: share of the episodes
-        that have the disturbances `manip_il.sim.events.STANDARD`.
+        A round whose dataset exists is read, not run again.
+
+        Args:
+            round_: The number of the round.
+            driver: Chooses the actions.
+            query: When the expert is queried; None for every state.
+            disturbed: The share of the episodes that have the disturbances
+                `manip_il.sim.events.STANDARD`.
         """
         here = self._folder(round_)
         config = self.config

@@ -68,10 +68,14 @@ _POSE = 6
 class Conversion:
     """Converts actions to the targets of a space and back, row by row.
 
-    robot: the arm, for `ee_delta` only. grippers: indices of the gripper openings, which are
-    absolute in `joint_delta`.
+    Attributes:
+        space: One of `ACTION_SPACES`.
+        robot: The arm, for `ee_delta` only.
+        grippers: Indices of the gripper openings, which are absolute in `joint_delta`.
 
-    Raises `UnknownName` for an unknown robot, `UsageError` for an arm with fewer than six joints.
+    Raises:
+        UnknownName: The robot is unknown.
+        UsageError: The arm has fewer than six joints.
     """
 
     space: str = JOINT_TARGET
@@ -144,12 +148,19 @@ class Conversion:
 def conversion_for(
     space: str, spec: EnvironmentSpec, start: Checkpoint | None = None
 ) -> Conversion:
-    """Return the conversion to a space for data of `spec`. start: the checkpoint that a fit
-    continues from, if any.
+    """Return the conversion to an action space for the data of an environment.
 
-    Raises `MismatchError` for a space other than `joint_target` if the data's actions are not joint
-    targets, and for `ee_delta` if the data's joint names are not the robot's. Also raises what
-    `Conversion` raises.
+    Args:
+        space: One of `ACTION_SPACES`.
+        spec: The specification of the environment or dataset.
+        start: The checkpoint that a fit continues from, if any. It decides which numbers are
+            gripper openings.
+
+    Raises:
+        MismatchError: The space is not `joint_target`, but the data's actions are not joint
+            targets; or it is `ee_delta`, and the data's joint names are not the robot's.
+        UnknownName: The robot is unknown, for `ee_delta`.
+        UsageError: The arm has fewer than six joints, for `ee_delta`.
     """
     grippers = start.grippers if start is not None else GRIPPERS.get(spec.action_meaning, LAST)
     found = Conversion(space, spec.robot if space == EE_DELTA else "", grippers)

@@ -36,8 +36,9 @@ Pipeline = PolicyProcessorPipeline[Any, Any]
 class MeasuredJointsStep(RelativeActionsProcessorStep):
     """Stores the raw joint state (B, n) of an observation; changes nothing.
 
-    converted: whether actions that come with observations are already converted, as in our
-    training.
+    Attributes:
+        converted: Whether actions that come with observations are already converted, as in our
+            training.
     """
 
     converted: bool = False
@@ -45,7 +46,8 @@ class MeasuredJointsStep(RelativeActionsProcessorStep):
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the same transition.
 
-        Raises `ManipError` if it has an action that is not converted yet.
+        Raises:
+            ManipError: The transition has an action that is not converted yet.
         """
         if transition.get(TransitionKey.ACTION) is not None and not self.converted:
             raise ManipError(
@@ -65,6 +67,11 @@ class MeasuredJointsStep(RelativeActionsProcessorStep):
 class JointTargetsStep(AbsoluteActionsProcessorStep):
     """Converts a policy's output (B, n), relative to the joints measured now, to joint targets
     and opening (B, n).
+
+    Attributes:
+        action_space: One of `ACTION_SPACES`.
+        robot: The arm, for `ee_delta` only.
+        grippers: Indices of the gripper openings, see `Conversion`.
     """
 
     action_space: str = JOINT_TARGET
@@ -74,7 +81,8 @@ class JointTargetsStep(AbsoluteActionsProcessorStep):
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the transition with joint targets.
 
-        Raises `ManipError` unless the output is for a single step.
+        Raises:
+            ManipError: The output is not for a single step, or its observation is missing.
         """
         targets = transition.get(TransitionKey.ACTION)
         states = self.relative_step.get_cached_state() if self.relative_step is not None else None
@@ -124,9 +132,14 @@ def is_in_processors(kind: str, found: Conversion) -> bool:
 
 
 def add_steps(before: Pipeline, after: Pipeline, found: Conversion) -> None:
-    """Add a conversion's steps to a policy's pre- and postprocessor.
+    """Add a conversion's steps to a policy's pre- and postprocessor, in place.
 
     The policy then sees only converted actions.
+
+    Args:
+        before: The preprocessor, which has a normaliser step.
+        after: The postprocessor.
+        found: The conversion.
     """
     measured = MeasuredJointsStep(converted=True)
     place = next(

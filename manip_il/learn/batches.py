@@ -30,8 +30,13 @@ class Order:
     """Row numbers in batches: a new shuffle of all rows every epoch, or draws in proportion to
     weights.
 
-    weights: one per row, (N,), to draw with replacement; None for epochs. A batch depends only on
-    the seed and the step, so there is no state to save.
+    A batch depends only on the seed and the step, so there is no state to save.
+
+    Args:
+        rows: The number of rows N.
+        weights: One weight per row, (N,), to draw with replacement; None for epochs.
+        batch_size: The number of rows in a batch.
+        seed: Decides all shuffles and draws.
     """
 
     def __init__(self, rows: int, weights: F64 | None, batch_size: int, seed: int) -> None:
@@ -77,10 +82,15 @@ def pictures_to_float(batch: dict[str, Any], cameras: Iterable[str]) -> dict[str
 class Augment:
     """Random crops and colour jitter.
 
-    shift: largest shift of a crop in each direction [pixels]; the border repeats the outermost
-    pixels (DrQ, Kostrikov et al. 2020, arXiv:2004.13649). brightness, contrast, saturation: largest
-    deviation of each factor from 1, as in torchvision's `ColorJitter`, but in a fixed order
-    (saturation, contrast, brightness) with one clamp at the end.
+    The factors are as in torchvision's `ColorJitter`, but are applied in a fixed order (saturation,
+    contrast, brightness) with one clamp at the end.
+
+    Attributes:
+        shift: Largest shift of a crop in each direction [pixels]; the border repeats the outermost
+            pixels (DrQ, Kostrikov et al. 2020, arXiv:2004.13649).
+        brightness: Largest deviation of the factor of brightness from 1.
+        contrast: Largest deviation of the factor of contrast from 1.
+        saturation: Largest deviation of the factor of saturation from 1.
     """
 
     shift: int = 4
@@ -89,10 +99,16 @@ class Augment:
     saturation: float = 0.2
 
     def __call__(self, pictures: Tensor, generator: torch.Generator) -> Tensor:
-        """Return pictures uint8 (B, 3, H, W) or (B, T, 3, H, W), on any device, as float32 of that
-        shape in [0, 1].
+        """Return the pictures, cropped and recoloured at random, as float32 in [0, 1].
 
-        Crop and colours are drawn once per sample, the same for all T, from a generator on the CPU.
+        Crop and colours are drawn once per sample, the same for all T.
+
+        Args:
+            pictures: Pictures uint8 (B, 3, H, W) or (B, T, 3, H, W), on any device.
+            generator: A generator on the CPU.
+
+        Returns:
+            Pictures of the same shape.
         """
         flat = pictures.flatten(0, -4)
         changed = torch.empty(flat.shape, dtype=torch.float32, device=flat.device)

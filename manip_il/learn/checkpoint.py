@@ -59,10 +59,24 @@ class Origin:
     """Content of `manip_il.json`: a policy's robot and task, its training data, and the options of
     its fit.
 
-    observation: one of `OBSERVATIONS`. cameras, image_size: those of its training pictures, if any;
-    look: the lighting of these pictures, as arguments of `sim.look.Look`, None if unknown.
-    datasets: name, frames and weight of each. action_space: the space that it learnt in, None for a
-    checkpoint older than this field.
+    Attributes:
+        robot: The robot's name.
+        task: The task's name.
+        fps: The control rate [Hz], as in `EnvironmentSpec`.
+        joint_names: Names of the numbers of the joint state and the action.
+        environment_state_names: Names of the numbers of the environment state.
+        action_meaning: As in `EnvironmentSpec`.
+        fingerprint: The fingerprint of the training data.
+        options: The options of the fit.
+        observation: One of `OBSERVATIONS`.
+        cameras: The cameras of the training pictures, if any.
+        image_size: The height and width of the training pictures [pixels], if any.
+        look: The lighting of the training pictures, as arguments of `sim.look.Look`; None if
+            unknown.
+        datasets: Name, frames and weight of each dataset.
+        action_space: The space that the policy learnt in; None for a checkpoint older than this
+            field.
+        object: As in `EnvironmentSpec`.
     """
 
     robot: str
@@ -98,8 +112,16 @@ class Origin:
         look: Mapping[str, Any] | None = None,
         **more: Any,
     ) -> Origin:
-        """Return the origin of a policy trained on data of `spec`. more: other fields of
-        `Origin`.
+        """Return the origin of a policy trained on data of `spec`.
+
+        Args:
+            spec: The specification of the training data.
+            fingerprint: The fingerprint of the training data.
+            options: The options of the fit.
+            observation: One of `OBSERVATIONS`. If it is `state`, cameras, picture size and lighting
+                are left out.
+            look: The lighting of the pictures, as arguments of `sim.look.Look`; None if unknown.
+            more: Other fields of `Origin`.
         """
         pictured = observation != "state"
         return cls(
@@ -133,7 +155,8 @@ def read_origin(path: Path) -> Origin | None:
     """Return the origin in a `pretrained_model` folder, or None if another tool (lerobot-train)
     wrote it.
 
-    Raises `ManipError` for a file that is incomplete or not ours.
+    Raises:
+        ManipError: The file is incomplete or not ours.
     """
     file = Path(path) / META_FILE
     if not file.is_file():
@@ -144,12 +167,19 @@ def read_origin(path: Path) -> Origin | None:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A policy on disk. path: its `pretrained_model` folder. config: its `config.json`.
+    """A policy on disk.
 
-    numbers: numeric input column -> size; pictures: camera -> (height, width) [pixels]; action:
-    size of the action. space: the action space that the policy learnt in; robot: the arm, for
-    `ee_delta` only; grippers: see `Conversion`. origin: None if another program wrote the folder.
-    processors: file -> steps, each with `registry_name` and `config`.
+    Attributes:
+        path: The policy's `pretrained_model` folder.
+        config: The content of its `config.json`.
+        numbers: Size of each numeric input by column.
+        pictures: Height and width of the pictures by camera [pixels].
+        action: Size of the action.
+        space: The action space that the policy learnt in.
+        robot: The arm, for `ee_delta` only.
+        grippers: See `Conversion`.
+        origin: The content of `manip_il.json`; None if another program wrote the folder.
+        processors: The steps of each processor's file, with `registry_name` and `config`.
     """
 
     path: Path
@@ -171,8 +201,8 @@ class Checkpoint:
     def open(cls, path: Path) -> Checkpoint:
         """Read and check the files of a folder, except its weights.
 
-        Raises `ManipError` if the folder is incomplete or gives a processor's step by an import
-        path.
+        Raises:
+            ManipError: The folder is incomplete, or gives a processor's step by an import path.
         """
         path = Path(path)
         config, origin = read_config(path), read_origin(path)
@@ -242,8 +272,10 @@ class Checkpoint:
     def cameras(self) -> CameraConfig | None:
         """Cameras, picture size and lighting as in training; None if the policy takes no pictures.
 
-        The lighting is the default if the checkpoint has none. Raises `UsageError` for cameras that
-        environments do not have, and for an invalid size.
+        The lighting is the default if the checkpoint has none.
+
+        Raises:
+            UsageError: Environments do not have the cameras, or the size is invalid.
         """
         if not self.pictures:
             return None
@@ -338,11 +370,16 @@ def in_one_line(what: str) -> Iterator[None]:
 def require_trust(
     settings: Mapping[str, Any], source: str, trust: bool, steps: Sequence[Mapping[str, Any]] = ()
 ) -> None:
-    """Raise `ManipError`, listing the names, if a policy loads models or files by name, unless
-    `trust` is given.
+    """Raise `ManipError` if a policy loads models or files by name, unless `trust` is given.
 
-    settings: the policy's options with `type`, as in `config.json`. source: where they come from,
-    for the message. steps: the processors' steps.
+    Args:
+        settings: The policy's options with `type`, as in `config.json`.
+        source: Where the options come from, for the message.
+        trust: Whether the policy's source is trusted.
+        steps: The processors' steps, each with `registry_name` and `config`.
+
+    Raises:
+        ManipError: The policy is not trusted; the message lists the names.
     """
     kind, named = settings["type"], list[Any]()
     if kind not in PLAIN or settings.get("vision_encoder_name"):
@@ -360,7 +397,11 @@ def require_trust(
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Return the `config.json` of a folder. Raises `ManipError` if the folder is incomplete."""
+    """Return the `config.json` of a folder.
+
+    Raises:
+        ManipError: The folder is incomplete.
+    """
     config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json")
     if not (path / WEIGHTS).is_file():
         raise ManipError(f"no {WEIGHTS} in {path}: the weights are missing")
@@ -374,8 +415,9 @@ def read_config(path: Path) -> dict[str, Any]:
 def processor_steps(path: Path) -> list[dict[str, Any]]:
     """Return the steps in a processor's file, each with `registry_name` and `config`.
 
-    Refuses steps given by import path, because LeRobot would import and call whatever a downloaded
-    file names.
+    Raises:
+        ManipError: The file cannot be read, or gives a step by an import path: LeRobot would import
+            and call whatever a downloaded file names.
     """
     values = checks.read_json(path, "a processor of LeRobot's")
     with in_one_line(f"{path} cannot be read"):
@@ -400,7 +442,8 @@ def find_policy(path: Path) -> Path:
     """Return `path` if it is a `pretrained_model` folder, else the best or newest one in this
     checkpoint or run.
 
-    Raises `UsageError` if there is none.
+    Raises:
+        UsageError: There is no policy.
     """
     for place in _PLACES:
         if (path / place / "config.json").is_file():
@@ -413,8 +456,14 @@ def find_policy(path: Path) -> Path:
 
 
 def hub_hint(path: Path, kind: str = "") -> str:
-    """Return how to pull `path` if it looks like a Hub repository, else "". kind: `datasets/`
-    for a dataset.
+    """Return how to pull a path that looks like a Hub repository.
+
+    Args:
+        path: The path that was not found.
+        kind: `datasets/` for a dataset.
+
+    Returns:
+        The end of a message, or "" if the path does not look like a Hub repository.
     """
     if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
         return ""

@@ -335,7 +335,9 @@ class KeypointEncoder(nn.Module):
     green and blue and torch's own initialisation every softmax began nearly uniform, and a goal of
     5 pixels was not found in 1,100 steps; now 300 suffice.
 
-    channels: number in each layer; the first two layers halve the picture's sides.
+    Args:
+        channels: Number in each layer; the first two layers halve the picture's sides.
+        keypoints: Number of keypoints K.
     """
 
     def __init__(self, channels: Sequence[int], keypoints: int) -> None:

@@ -66,11 +66,18 @@ class PolicyFunction(nn.Module):
 
 
 def export_onnx(checkpoint: Checkpoint | Path) -> tuple[bytes, float]:
-    """Return a policy, or that in a `pretrained_model` folder, as ONNX, and the largest change of
-    an action by that.
+    """Return a policy as ONNX, and the largest change of an action by that.
 
-    Raises `ManipError` for a policy that cannot be exported or whose file would act differently
-    from the checkpoint, and what `LearnedPolicy.load` raises.
+    Args:
+        checkpoint: The policy, or its `pretrained_model` folder.
+
+    Returns:
+        The content of the file, and the change [rad], [m] or, for robots in servos' units,
+        [degrees].
+
+    Raises:
+        ManipError: The policy cannot be loaded or exported, or its file would act differently from
+            the checkpoint.
     """
     import onnx
     import onnxruntime

@@ -41,16 +41,21 @@ def _by_default(name: str) -> str:
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Options of a fit; None stands for the default of the policy's type.
+    """Options of a fit; None means the default of the policy's type.
 
-    policy: `type` or `path`, and the options of that policy (`loss`, `width`, `chunk_size`, ...).
-    action_space: see `manip_il.learn.action_spaces`; by default that of the initial checkpoint, if
-    there is one. threads: with a second thread a fit is up to 1.8 times as fast if a core is free,
-    and tens of times slower if none is. trust: whether models that the policy or its checkpoint
-    names may be loaded. seed: for weights and batches. init_from: a `pretrained_model` folder with
-    the initial weights.
+    Attributes:
+        policy: `type` or `path`, and the options of that policy (`loss`, `width`, `chunk_size`,
+            ...).
+        action_space: See `manip_il.learn.action_spaces`; by default that of the initial checkpoint,
+            if there is one.
+        threads: With a second thread a fit is up to 1.8 times as fast if a core is free, and tens
+            of times slower if none is.
+        trust: Whether models that the policy or its checkpoint names may be loaded.
+        seed: For weights and batches.
+        init_from: A `pretrained_model` folder with the initial weights.
 
-    Raises `UsageError` for a number out of range, and for options that do not go together.
+    Raises:
+        UsageError: A number is out of range, or options do not go together.
     """
 
     policy: Mapping[str, Any] = option(
@@ -126,7 +131,11 @@ class FitConfig:
 
     @cached_property
     def start(self) -> Checkpoint | None:
-        """The checkpoint in `policy.path`. Raises `ManipError` if it cannot be read."""
+        """The checkpoint in `policy.path`.
+
+        Raises:
+            ManipError: The checkpoint cannot be read.
+        """
         return _open(Path(self.policy["path"])) if "path" in self.policy else None
 
     @cached_property

@@ -44,7 +44,11 @@ def policy_types() -> tuple[str, ...]:
 
 
 def policy_class(kind: str) -> type[PreTrainedConfig]:
-    """Return the configuration class of a policy type. Raises `UnknownName` for an unknown type."""
+    """Return the configuration class of a policy type.
+
+    Raises:
+        UnknownName: The type is unknown.
+    """
     policy_types()
     return _registered(PreTrainedConfig, kind, "policy")
 
@@ -60,9 +64,13 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
     """Return the policy configuration of a fit: new, or that of the initial checkpoint with
     changes.
 
-    The device is the GPU if there is one. Raises `UnknownName` for an unknown type or option,
-    `UsageError` for a value that LeRobot refuses, `ManipError` if it names models that are not
-    trusted.
+    The device is the GPU if there is one.
+
+    Raises:
+        UnknownName: The policy's type or an option is unknown.
+        UsageError: LeRobot refuses a value, PyTorch does not find the device, or the initial
+            checkpoint needs its dataset of states again.
+        ManipError: The policy names models that are not trusted.
     """
     cls = policy_class(fit.kind)
     source, saved = f"--policy.type={fit.kind}", dict[str, Any]()
@@ -89,8 +97,16 @@ def policy_config(fit: FitConfig) -> PreTrainedConfig:
 
 
 def choice(base: type[Any], settings: Mapping[str, Any], group: str) -> Any:
-    """Return the configuration (of an optimiser, a schedule, ...) that `base` registers as
-    `settings["type"]`.
+    """Return the optimiser, schedule or other configuration that `settings` describes.
+
+    Args:
+        base: LeRobot's base class, with which the types are registered.
+        settings: The `type`, and that type's options by name.
+        group: The name of the options on the command line, such as `optimizer`, for messages.
+
+    Raises:
+        UnknownName: The type or an option is unknown.
+        UsageError: LeRobot refuses a value.
     """
     own = {name: value for name, value in settings.items() if name != "type"}
     cls = _registered(base, settings.get("type"), f"--{group}.type")
@@ -98,10 +114,16 @@ def choice(base: type[Any], settings: Mapping[str, Any], group: str) -> Any:
 
 
 def decode(cls: type[Any], settings: Mapping[str, Any], source: str) -> Any:
-    """Return a LeRobot dataclass built from `settings`. source: where these come from, for
-    messages.
+    """Return a LeRobot dataclass built from its options.
 
-    Raises `UnknownName` for an unknown option, `UsageError` for a value that LeRobot refuses.
+    Args:
+        cls: The dataclass.
+        settings: The values of its options by name.
+        source: Where the options come from, for messages.
+
+    Raises:
+        UnknownName: An option is unknown.
+        UsageError: LeRobot refuses a value.
     """
     known = [
         field.name for field in dataclasses.fields(cls) if field.init and field.name not in NOT_OURS
@@ -164,8 +186,16 @@ def set_features(
 
     By default LeRobot's state-based policies leave `observation.environment_state` in its raw
     units; here it is normalised like the joint state. They refuse the joints alone, which get an
-    environment state of no numbers, see `JointsAloneStep`. Raises `ManipError` for features that
-    the policy refuses.
+    environment state of no numbers, see `JointsAloneStep`.
+
+    Args:
+        policy: The policy's options, which are changed in place.
+        features: The `features` of the dataset's `info.json`.
+        inputs: The columns that the policy observes.
+        observation: The value of `--observation`, for the message.
+
+    Raises:
+        ManipError: The policy refuses the features.
     """
     policy.input_features, policy.output_features = policy_features(features, inputs)
     if list(inputs) == [STATE] and policy.type not in OWN_SPACE:
@@ -188,10 +218,19 @@ def lerobot_options(
     action space.
 
     LeRobot writes these as `train_config.json`, apart from the dataset and the folder, which are
-    not known yet. action_meaning: as in the dataset; actions other than joint targets are by
-    default learnt unchanged. Raises what `policy_config` raises, `UnknownName` or `UsageError` for
-    an optimiser, a schedule or a logger that LeRobot does not know, `MismatchError` for an initial
-    checkpoint with another action space.
+    not known yet.
+
+    Args:
+        fit: The options of the fit.
+        action_meaning: As in the dataset; actions other than joint targets are by default learnt
+            unchanged.
+
+    Raises:
+        UnknownName: The policy's type, the optimiser, the schedule or one of their options is
+            unknown.
+        UsageError: LeRobot refuses a value, or the policy does not support the action space.
+        MismatchError: The initial checkpoint has another action space.
+        ManipError: The policy names models that are not trusted.
     """
     policy = policy_config(fit)
     space = _action_space(policy, fit, action_meaning)

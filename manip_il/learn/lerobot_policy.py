@@ -72,8 +72,11 @@ def build_processors(
 ) -> tuple[Any, Any]:
     """Return new LeRobot pre- and postprocessors with the dataset's statistics.
 
-    conversion: added to the processors, if given; the statistics must then be those of the
-    converted actions.
+    Args:
+        config: The policy's options, with features.
+        meta: The metadata of the training data. With a conversion, its statistics must be those of
+            the converted actions.
+        conversion: The conversion that the processors do, if any.
     """
     before, after = make_pre_post_processors(
         config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta
@@ -88,10 +91,18 @@ def build_processors(
 def load_processors(
     checkpoint: Checkpoint, config: PreTrainedConfig, *, trust: bool = False, learns: bool = False
 ) -> tuple[Any, Any]:
-    """Return the processors of a checkpoint, on the configuration's device. learns: whether a fit
-    continues from it.
+    """Return the pre- and postprocessor of a checkpoint, on the configuration's device.
 
-    Raises what `Checkpoint.require_trust` and LeRobot raise.
+    Also raises what LeRobot raises.
+
+    Args:
+        checkpoint: The checkpoint.
+        config: The policy's options, with the device.
+        trust: Whether to load models that the processors name.
+        learns: Whether a fit continues from the checkpoint.
+
+    Raises:
+        ManipError: The policy or its processors name models that are not trusted.
     """
     checkpoint.require_trust(trust)
     names = [step["registry_name"] for step in checkpoint.processors.get(PROCESSORS[0], ())]
@@ -124,12 +135,19 @@ def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
 def load_policy(
     checkpoint: Checkpoint, device: str, trust: bool = False
 ) -> tuple[PreTrainedPolicy, Any, Any]:
-    """Return the policy of a checkpoint and its processors.
+    """Return the policy of a checkpoint, and its pre- and postprocessor.
 
     Downloads only what a trusted policy names.
 
-    Raises `UnknownName` for an unknown type, `ManipError` if packages are missing, if the policy
-    names models that are not trusted, or if LeRobot cannot load the folder.
+    Args:
+        checkpoint: The checkpoint.
+        device: Torch's name for the device.
+        trust: Whether to load models and code that the checkpoint names.
+
+    Raises:
+        UnknownName: The type of policy is unknown.
+        ManipError: Packages are missing, the policy names models that are not trusted, or LeRobot
+            cannot load the folder.
     """
     cls = policy_class(checkpoint.kind)
     checkpoint.require_trust(trust)

@@ -26,7 +26,12 @@ _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class Head:
-    """A family of action distributions. n: numbers in an action. size: parameters per row."""
+    """A family of action distributions.
+
+    Attributes:
+        n: Numbers in an action.
+        size: Parameters per row.
+    """
 
     n: int
     size: int
@@ -88,6 +93,10 @@ class MixtureHead(Head):
 
     Acts with the mean of the heaviest component: the mixture's own mean may lie between two ways
     around an obstacle, where no demonstration goes.
+
+    Args:
+        n: Numbers in an action.
+        components: Number of Gaussians K.
     """
 
     def __init__(self, n: int, components: int) -> None:
@@ -127,6 +136,11 @@ class CategoricalHead(Head):
     Acts with the expectation over the likeliest bin and the max(1, `pad`) bins on either side of
     it: exact within a bin, unlike the argmax, and never between two separate modes, unlike the
     expectation over all bins.
+
+    Args:
+        n: Numbers in an action.
+        bins: Bins per dimension, at least 2.
+        sigma: Standard deviation of a smeared target [bins].
     """
 
     def __init__(self, n: int, bins: int, sigma: float) -> None:

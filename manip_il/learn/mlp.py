@@ -183,7 +183,10 @@ def training_table(config: MLPConfig, dataset_meta: Any) -> Table:
     """Return the columns of the training data, (N, d) each.
 
     `manip-il train` has read them already (`dataset_meta.table`); for `lerobot-train` they are read
-    here. Raises `ManipError` for an action space that only `manip-il train` converts to.
+    here.
+
+    Raises:
+        ManipError: Only `manip-il train` converts to the action space.
     """
     if (table := getattr(dataset_meta, "table", None)) is not None:
         return table
@@ -216,7 +219,11 @@ def labelled(table: Table, inputs: Sequence[str]) -> tuple[Tensor, Tensor]:
 def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:
     """Return the indices, in the environment state, of offsets between two things.
 
-    `UsageError` if there are none.
+    Args:
+        features: The `features` of the dataset's `info.json`.
+
+    Raises:
+        UsageError: There are no offsets.
     """
     names = features[ENVIRONMENT_STATE]["names"] if ENVIRONMENT_STATE in features else []
     found = tuple(i for i, name in enumerate(names) if "_from_" in name)

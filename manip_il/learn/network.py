@@ -101,14 +101,22 @@ Statistics = Mapping[str, Tensor]  # named as the buffers of `MLPNetwork`
 
 
 def fit_statistics(inputs: F32, targets: F32, loss: str) -> Statistics:
-    """Return statistics of inputs (N, d) and targets (N, n), in raw units ([rad], [m]), as float32
-    vectors.
+    """Return the statistics of a policy's inputs and targets.
 
     The network maps x = (input - input_mean) * input_scale to y, and target = target_mean +
     target_scale * y is clamped to [target_low, target_high], the range of the data.
 
     Targets are scaled by mean and deviation, or, for `categorical`, by the middle and half-width of
     their range, which puts them in [-1, 1]. A constant target has scale 0: it equals its mean.
+
+    Args:
+        inputs: Inputs (N, d) in raw units ([rad], [m]).
+        targets: Targets (N, n) in raw units ([rad], [m]).
+        loss: One of `LOSSES`.
+
+    Returns:
+        Vectors (d,) of the inputs and (n,) of the targets, in single precision, by the names of the
+        buffers of `MLPNetwork`.
     """
     low, high = targets.min(0).astype(np.float64), targets.max(0).astype(np.float64)
     if loss == "categorical":
@@ -134,7 +142,15 @@ def _mean_and_deviation(values: F32) -> tuple[F64, F64]:
 def perceptron(
     inputs: int, width: int, depth: int, outputs: int, activation: type[nn.Module]
 ) -> nn.Sequential:
-    """Return a network of `depth` hidden layers, (B, inputs) to (B, outputs)."""
+    """Return a network of `depth` hidden layers, (B, inputs) to (B, outputs).
+
+    Args:
+        inputs: Numbers in an input.
+        width: Units per hidden layer.
+        depth: Hidden layers, at least 1.
+        outputs: Numbers in an output.
+        activation: The class of the activation after each hidden layer.
+    """
     layers: list[nn.Module] = []
     for size in (inputs, *[width] * (depth - 1)):
         layers += [nn.Linear(size, width), activation()]
@@ -150,6 +166,11 @@ class MLPNetwork(nn.Module):
     the network adds itself; the targets of grippers are absolute. In all other spaces it returns
     the targets, which `action_spaces` converts to actions. A row's action does not depend on the
     other rows, bit for bit.
+
+    Args:
+        inputs: Numbers in an input, n + k.
+        n: Numbers in an action.
+        config: The sizes and kinds of the network.
     """
 
     added: Tensor  # 1 for the measured joints that are added to the targets, else 0, (n,)
@@ -279,7 +300,8 @@ def require_device(device: str) -> None:
 def read_weights(pretrained_model: Path) -> dict[str, Tensor]:
     """Return weights (n, d) and statistics (n,) by name from a folder.
 
-    `ManipError` if they cannot be read.
+    Raises:
+        ManipError: They cannot be read.
     """
     path = Path(pretrained_model) / WEIGHTS
     with in_one_line(f"{path} cannot be read"), native_path(path, "weights") as opened:
@@ -295,8 +317,14 @@ def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
     The input statistics stay those of the new data: the first layer compensates for the difference.
     (An input normaliser frozen at the first round of DAgger puts later rounds' states out of
     scale.) The range of the targets is also that of the new data; their mean and scale are copied,
-    as they are only the unit of the outputs. Raises `ManipError` for a file that cannot be read or
-    does not fit.
+    as they are only the unit of the outputs.
+
+    Args:
+        network: The network, which has the statistics of the new data.
+        pretrained_model: The folder of the policy to start from.
+
+    Raises:
+        ManipError: The weights cannot be read or do not fit.
     """
     of_new_data = ("input_mean", "input_scale", "target_low", "target_high")
     kept = {name: getattr(network, name).clone() for name in of_new_data}

@@ -26,8 +26,11 @@ Batch = dict[str, torch.Tensor]
 
 
 class LearnedPolicy:
-    """Actions from a LeRobot checkpoint, for many episodes at once. checkpoint: its inputs,
-    outputs and origin.
+    """Actions from a LeRobot checkpoint, for many episodes at once.
+
+    Args:
+        policy: The policy, loaded.
+        checkpoint: Its inputs, outputs and origin.
     """
 
     def __init__(self, policy: EpisodePolicy | _Perceptron, checkpoint: Checkpoint):
@@ -42,14 +45,22 @@ class LearnedPolicy:
         *,
         trust: bool = False,
     ) -> LearnedPolicy:
-        """Load any LeRobot `pretrained_model` folder, only from JSON and safetensors unless
-        `trust`.
+        """Load any LeRobot checkpoint, only from JSON and safetensors unless `trust` is set.
 
         The mlp is loaded without LeRobot, whose import takes seconds; other policies by LeRobot's
-        own factory. task: instruction for a policy that reads language, if `begin` gives no other.
-        trust: also load models and code that the checkpoint names. Raises what `Checkpoint.open`
-        raises, `ManipError` for files that do not match or, without `trust`, that name models to
-        load; `UnknownName` for an unknown type of policy.
+        own factory.
+
+        Args:
+            checkpoint: The checkpoint, or its `pretrained_model` folder.
+            device: Torch's name for the device.
+            task: Instruction for a policy that reads language, if `begin` gives no other.
+            trust: Whether to load models and code that the checkpoint names.
+
+        Raises:
+            UsageError: The device is a GPU, but PyTorch finds none.
+            UnknownName: The type of policy is unknown.
+            ManipError: The folder is incomplete, its files do not match, or they name models to
+                load and `trust` is not set.
         """
         require_device(device)
         opened = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint.open(checkpoint)
@@ -77,14 +88,24 @@ class LearnedPolicy:
         images: Images | None = None,
         episodes: Sequence[int] | None = None,
     ) -> F64:
-        """Return absolute actions, (B, n), as in the training data: usually joint targets [rad],
-        gripper command [m].
+        """Return an absolute action for each row.
 
-        states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a
-        number for each row, by default its index; the policy's memory of an episode and its random
-        draws depend on that number. An episode that is not in `episodes` has ended. An action is
-        bit-identical whatever the other rows are. Raises `NotFiniteError` naming the row for an
-        action that is not finite, `MismatchError` for pictures that are missing or of another size.
+        An action is bit-identical whatever the other rows are.
+
+        Args:
+            states: Joint states (B, n).
+            environment_states: Environment states (B, k).
+            images: Pictures uint8 (B, H, W, 3) by camera.
+            episodes: A number for each row, by default its index. The policy's memory of an episode
+                and its random draws depend on that number. An episode that is not listed has ended.
+
+        Returns:
+            Actions (B, n), as in the training data: usually joint targets [rad] and a gripper
+            command [m].
+
+        Raises:
+            NotFiniteError: An action is not finite; the message names the row.
+            MismatchError: Pictures are missing or have another size.
         """
         if not len(states):
             return np.empty((0, self.checkpoint.action))
@@ -102,8 +123,9 @@ class LearnedPolicy:
     def begin(self, instructions: Mapping[int, str]) -> None:
         """Reset the memory of episodes that begin.
 
-        instructions: episode number -> text for a policy that reads language; "" means the `task`
-        given to `load`.
+        Args:
+            instructions: For each episode's number, the text for a policy that reads language; ""
+                means the `task` given to `load`.
         """
         self._policy.begin(instructions)
 
@@ -131,11 +153,15 @@ class LearnedPolicy:
 def actions_along(
     policy: LearnedPolicy, table: Mapping[str, NDArray[Any]]
 ) -> Iterator[tuple[I64, F64]]:
-    """Yield row numbers (B,) and a policy's actions (B, n) for each time step of whole recorded
-    episodes.
+    """Yield a policy's actions for each time step of whole recorded episodes.
 
-    table: columns `observation.state`, `observation.environment_state` and `episode_index`, one
-    episode after another.
+    Args:
+        policy: The policy, which must take no pictures.
+        table: The columns `observation.state` (N, n), `observation.environment_state` (N, k) and
+            `episode_index` (N,) or (N, 1), ascending.
+
+    Yields:
+        For each time step, the row numbers (B,) of its frames in the table, and the actions (B, n).
     """
     episodes = table[EPISODE_INDEX].reshape(-1)
     _, lengths = np.unique(episodes, return_counts=True)

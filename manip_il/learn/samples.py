@@ -34,11 +34,12 @@ _MAX_HELD_OUT = 1_024  # number of validation samples
 
 @dataclass(frozen=True)
 class Windows:
-    """The frames that each sample consists of. episodes: the episode of every frame, (N,),
-    ascending.
+    """The frames that each sample consists of.
 
-    deltas: column -> offsets from the sample's own frame, (K,); other columns have only the
-    sample's own frame.
+    Attributes:
+        episodes: The episode of every frame, (N,), ascending.
+        deltas: Offsets from the sample's own frame, (K,), by column; other columns have only the
+            sample's own frame.
     """
 
     episodes: I64
@@ -54,10 +55,15 @@ class Windows:
         return np.searchsorted(self.episodes, self.episodes, side="right") - 1
 
     def rows(self, samples: I64, key: str) -> tuple[I64, Batch]:
-        """Return the row numbers of a column's windows, (B, K), and `<column>_is_pad` -> its
-        padding mask, (B, K).
+        """Return the row numbers of a column's windows.
 
-        For a column without a window, return `samples` themselves, (B,), and no mask.
+        Args:
+            samples: The samples' own rows, (B,).
+            key: The column.
+
+        Returns:
+            The row numbers, (B, K), and the padding mask, (B, K), under the name `<column>_is_pad`.
+            For a column without a window, `samples` themselves, (B,), and no mask.
         """
         if key not in self.deltas:
             return samples, {}
@@ -68,8 +74,13 @@ class Windows:
     def usable(self, valid: NDArray[np.bool_], drop_last: int = 0) -> I64:
         """Return the samples to train on, (S,): those with valid labels in the whole window.
 
-        valid: whether each frame's label is valid, (N,). drop_last: number of unused frames at the
-        end of each episode, LeRobot's `drop_n_last_frames`. Raises `ManipError` if nothing is left.
+        Args:
+            valid: Whether each frame's label is valid, (N,).
+            drop_last: Number of unused frames at the end of each episode, LeRobot's
+                `drop_n_last_frames`.
+
+        Raises:
+            ManipError: Nothing is left.
         """
         samples = np.flatnonzero(np.arange(len(valid)) + drop_last <= self._last)
         sound = valid[self.rows(samples, ACTION)[0]]
@@ -85,7 +96,10 @@ class Windows:
 def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) -> Windows:
     """Return the windows of a policy's training samples.
 
-    episodes: the episode of every frame, (N,).
+    Args:
+        policy: The policy's options, which define the offsets.
+        columns: The columns that the policy observes, and the action.
+        episodes: The episode of every frame, (N,), ascending.
     """
     actions, observations = policy.action_delta_indices, policy.observation_delta_indices
     wanted = {key: actions if key == ACTION else observations for key in columns}
@@ -98,9 +112,13 @@ def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) 
 class Samples:
     """Samples in memory; a batch is one gather per column.
 
-    columns: numeric columns, (N, d) or (N,), by LeRobot's names. pictures: camera column -> uint8
-    (N, 3, H, W). tasks: text of every `task_index`, (M,). train, held_out: rows of the samples to
-    train on and to validate with, (S,) each.
+    Attributes:
+        windows: The frames that each sample consists of.
+        columns: Numeric columns, (N, d) or (N,), by LeRobot's names.
+        pictures: Pictures uint8 (N, 3, H, W) by camera column.
+        tasks: The text of every `task_index`, (M,).
+        train: Rows of the samples to train on, (S,).
+        held_out: Rows of the samples to validate with, (S,).
     """
 
     windows: Windows
@@ -203,12 +221,16 @@ def valid_frames(table: Table) -> NDArray[np.bool_]:
 
 
 def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I64]:
-    """Return the rows to train on and to hold out.
+    """Return the rows to train on and to hold out; whole episodes are held out.
 
-    Whole episodes are held out, about `fraction` of them.
+    Args:
+        episodes: The episode of every row, (N,).
+        fraction: Share of the episodes to hold out. Nothing is held out if it rounds to none or all
+            of them.
+        seed: Decides which episodes are held out.
 
-    episodes: the episode of every row, (N,). Nothing is held out if `fraction` rounds to none or
-    all of the episodes.
+    Returns:
+        Row numbers to train on, (N - h,), and to hold out, (h,), both ascending.
     """
     names = np.unique(episodes)
     count = round(fraction * len(names))
@@ -220,16 +242,23 @@ def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I6
 
 
 def rabc_weights(path: Path, episodes: I64, ahead: int) -> F64:
-    """Return the weight of every frame, (N,), at most 1, from a file with the progress of every
-    frame.
+    """Return the weight of every frame, from a file with the progress of every frame.
 
     The weights are those of LeRobot's RA-BC (Chen et al. 2025, arXiv:2509.25358, equations 8 and
     9). LeRobot multiplies losses by them; here samples are drawn in proportion to them, which gives
     the same mean gradient.
 
-    episodes: the dataset's `episode_index`, (N,). ahead: number of frames over which the gain in
-    progress is measured. Raises `ManipError` if the file cannot be read or every frame weighs 0,
-    `MismatchError` for another dataset's file.
+    Args:
+        path: The file, as LeRobot writes it (`rabc.parquet`).
+        episodes: The dataset's `episode_index`, (N,).
+        ahead: Number of frames over which the gain in progress is measured.
+
+    Returns:
+        Weights (N,) in [0, 1], the greatest of which is 1.
+
+    Raises:
+        ManipError: The file cannot be read, or every frame weighs 0.
+        MismatchError: The file belongs to another dataset.
     """
     from lerobot.rewards.sarm.rabc import RABCWeights  # its import takes seconds
 

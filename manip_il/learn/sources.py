@@ -21,10 +21,17 @@ from manip_il.worlds.contract import EnvironmentSpec
 
 
 def row_weights(datasets: Sequence[Dataset], shares: Sequence[float], rows: I64) -> F64:
-    """Return the relative sampling weight of each training row, (S,).
+    """Return the relative sampling weight of each training row.
 
-    shares: relative shares of the samples drawn from each dataset. rows: frame numbers in the
-    concatenated datasets.
+    The rows of a dataset share its weight equally.
+
+    Args:
+        datasets: The datasets.
+        shares: Relative shares of the samples drawn from each dataset.
+        rows: Frame numbers in the concatenated datasets, (S,).
+
+    Returns:
+        Weights (S,), which sum to the shares of the datasets that have rows.
     """
     which = np.searchsorted(np.cumsum([*map(len, datasets)]), rows, side="right")
     return np.asarray(shares)[which] / np.bincount(which)[which]
@@ -33,10 +40,16 @@ def row_weights(datasets: Sequence[Dataset], shares: Sequence[float], rows: I64)
 def check_same_sources(
     roots: Sequence[Path], specs: Sequence[EnvironmentSpec], *, pictures: bool, language: bool
 ) -> None:
-    """Raise `MismatchError` naming both sides unless datasets can be used as one.
+    """Raise `MismatchError` unless several datasets can be used as one.
 
-    pictures: whether the policy takes them, so that cameras and sizes must agree, too. language:
-    whether the policy reads an instruction; if not, the task must be the same.
+    Args:
+        roots: The folders of the datasets, for the message.
+        specs: The specifications of the datasets.
+        pictures: Whether the policy takes pictures, so that cameras and sizes must agree, too.
+        language: Whether the policy reads an instruction; if not, the task must be the same.
+
+    Raises:
+        MismatchError: A dataset differs from the first; the message names both.
     """
     what = (*(("cameras", "image_size") if pictures else ()), *(() if language else ("task",)))
     for root, spec in zip(roots[1:], specs[1:], strict=True):
@@ -50,8 +63,16 @@ def check_same_sources(
 def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:
     """Return the columns of a dataset that a policy observes, by LeRobot's names.
 
-    Without `observation.environment_state` the joints are enough for an mlp, and where there are no
-    pictures either. Raises `ManipError`, with a remedy, for a column that the dataset lacks.
+    Without `observation.environment_state` the joints are enough for an mlp, and for any policy if
+    there are no pictures either.
+
+    Args:
+        config: The options of the fit.
+        root: The folder of the dataset, for the message.
+        info: The dataset's `info.json`.
+
+    Raises:
+        ManipError: The dataset lacks a column; the message says what to do.
     """
     pictured = [key for key, feature in info.features.items() if feature.is_rgb]
     cameras = pictured if config.takes_images else []

@@ -131,7 +131,12 @@ class Trainer:
             self.build_networks(resumed)
 
     def read_data(self, columns: Sequence[str], on_frames: Callable[[int], None] | None) -> Samples:
-        """Read the samples of the datasets, of which the policy observes `columns`."""
+        """Read the samples of the datasets.
+
+        Args:
+            columns: The columns that the policy observes.
+            on_frames: Called with the number of newly decoded pictures.
+        """
         policy, config = self.pipeline.policy, self.config
         if policy.type in OWN_SPACE:
             policy.action_space = self.conversion.space
@@ -150,7 +155,13 @@ class Trainer:
         )
 
     def draw_order(self, shares: Sequence[float], weights: F64 | None) -> Order:
-        """Return the order in which all processes together draw the training samples."""
+        """Return the order in which all processes together draw the training samples.
+
+        Args:
+            shares: Share of the samples from each dataset; empty for none.
+            weights: How often each frame is drawn, relative to the others, (N,). They replace the
+                shares.
+        """
         rows = self.data.train
         drawn = row_weights(self.datasets, shares, rows) if shares else None
         drawn = drawn if weights is None else weights[rows]
@@ -204,11 +215,15 @@ class Trainer:
     def fit(self, on_step: Callable[[dict[str, Any]], None] | None = None) -> Path:
         """Take the remaining steps, with metrics and checkpoints.
 
-        Return the last checkpoint's `pretrained_model`.
+        Args:
+            on_step: Called after every step, with the metrics if there are any, else with {}. An
+                exception from it ends the fit; after `KeyboardInterrupt` a checkpoint is saved.
 
-        on_step: called after every step, with the metrics if there are any, else with {}; an
-        exception from it ends the fit (after `KeyboardInterrupt` a checkpoint is saved). Raises
-        `NotFiniteError` if the loss is not finite.
+        Returns:
+            The last checkpoint's `pretrained_model` folder.
+
+        Raises:
+            NotFiniteError: The loss is not finite.
         """
         self.pipeline.output_dir = self.output_dir
         metrics = contextlib.nullcontext(list[Writer]())
@@ -256,7 +271,8 @@ class Trainer:
     def take_step(self, metrics: MetricsTracker) -> None:
         """Take one gradient step, which `metrics` counts.
 
-        Raises `NotFiniteError` if the loss is not finite.
+        Raises:
+            NotFiniteError: The loss is not finite.
         """
         update_policy(
             metrics,

@@ -42,7 +42,12 @@ Writer = Callable[[Record], None]
 def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
     """Return the folder `checkpoints/last` to resume from, or None if there is none.
 
-    Raises `FolderExistsError` if there is one, unless `resume`.
+    Args:
+        output_dir: The folder of the run.
+        resume: Whether to continue from a checkpoint that is there.
+
+    Raises:
+        FolderExistsError: There is a checkpoint, and `resume` is not set.
     """
     last = output_dir / "checkpoints/last"
     if not (last / PRETRAINED_MODEL).is_dir():
@@ -55,7 +60,8 @@ def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
 def read_step(checkpoint: Path) -> dict[str, Any]:
     """Return what `training_step.json` in a checkpoint folder holds.
 
-    Raises `ManipError` if it cannot be read.
+    Raises:
+        ManipError: The file cannot be read.
     """
     return checks.read_json(checkpoint / TRAINING_STATE / STEP_FILE, "the step of a run")
 
@@ -64,9 +70,10 @@ def read_step(checkpoint: Path) -> dict[str, Any]:
 def new_checkpoint(final: Path) -> Generator[Path]:
     """Yield an empty folder to write a checkpoint into.
 
-    On exit it is renamed to `final` and becomes `last`.
+    On exit it is renamed to `final` and becomes `last`. After an exception it is removed.
 
-    It is removed after an exception. Raises `ManipError` if the disk is full or read-only.
+    Raises:
+        ManipError: The disk is full or read-only.
     """
     # replaces the folder of a run killed before it switched `last`
     with new_folder(final, replaces=CHECKPOINT) as new:
@@ -81,8 +88,12 @@ def new_checkpoint(final: Path) -> Generator[Path]:
 
 
 def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -> None:
-    """Write our own files of a checkpoint: the origin, and `step`, the content of
-    `training_step.json`.
+    """Write the files of a checkpoint that LeRobot does not write.
+
+    Args:
+        checkpoint: The folder of the checkpoint.
+        origin: The content of `manip_il.json`.
+        step: The content of `training_step.json`.
     """
     for path, values in (
         (f"{PRETRAINED_MODEL}/{META_FILE}", origin.to_json()),
@@ -125,9 +136,13 @@ def metric_writers(
 
 
 def json_lines(path: Path, step: int) -> Writer:
-    """Drop the lines after `step`.
+    """Drop the lines of a metrics file after a step, and return a function that appends a line.
 
-    Return a function that appends a line, with null for non-finite numbers.
+    The function writes null for numbers that are not finite.
+
+    Args:
+        path: The metrics file.
+        step: Steps already taken; with 0 all lines are dropped.
     """
     kept = [record for record in read_lines(path) if record["step"] <= step] if step > 0 else []
     write_file(path, "".join(f"{json.dumps(record)}\n" for record in kept).encode())

@@ -36,18 +36,30 @@ _RENAMED = {"agent_pos": STATE, "environment_state": ENVIRONMENT_STATE}
 class ManipILEnv(EnvConfig):
     """One robot at one task, for lerobot-eval and lerobot-train.
 
-    task: a name in gymnasium (`PandaPickPlace-v0`, `PickPlace-v0`), or the path of a file with a
-    task of your own. robot: for tasks of any robot (`PickPlace-v0`, a file), a name or YAML file;
-    by default panda. A file is opened only if it is named on the command line or, in Python, by a
-    `Path`; not if a file of options names it. observation: `state` (joints and
-    `environment_state`), `images` (joints and cameras) or `both`. cameras: comma-separated names.
-    observation_height, observation_width: size of their pictures [pixels]. fps, episode_length,
-    tolerance, success_steps, object: `control_hz`, `horizon`, ... of
-    `manip_il.sim.config.EnvConfig`. render_mode: with `none` lerobot-eval's films are black, which
-    needs no OpenGL and hardly any time.
+    A file with a task or a robot is opened only if it is named on the command line or, in Python,
+    by a `Path`; not if a file of options names it.
 
-    Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number
-    out of range.
+    Attributes:
+        task: A name in gymnasium (`PandaPickPlace-v0`, `PickPlace-v0`), or the path of a file with
+            a task of your own.
+        robot: For tasks of any robot (`PickPlace-v0`, a file), a name or YAML file; by default
+            panda.
+        fps: `control_hz` of `manip_il.sim.config.EnvConfig`.
+        observation: `state` (joints and `environment_state`), `images` (joints and cameras) or
+            `both`.
+        cameras: Comma-separated names.
+        observation_height: Height of the pictures [pixels].
+        observation_width: Width of the pictures [pixels].
+        episode_length: `horizon` of `manip_il.sim.config.EnvConfig`.
+        tolerance: As in `manip_il.sim.config.EnvConfig`.
+        success_steps: As in `manip_il.sim.config.EnvConfig`.
+        object: As in `manip_il.sim.config.EnvConfig`.
+        render_mode: `rgb_array` or `none`. With `none` lerobot-eval's films are black, which needs
+            no OpenGL and hardly any time.
+
+    Raises:
+        UnknownName: The task, the observation, a camera or the render mode is unknown.
+        UsageError: A number is out of range, or the task is for another robot.
     """
 
     task: str | None = "PandaPickPlace-v0"
@@ -96,11 +108,15 @@ class ManipILEnv(EnvConfig):
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, VectorEnv]]:
-        """Return the environments in LeRobot's form, in processes forked from a server that has
-        done the slow imports.
+        """Return the environments in LeRobot's form.
 
-        Python 3.12 should preload the running command by itself, but its fork server loses the path
-        of that command.
+        With `use_async_envs` their processes are forked from a server that has done the slow
+        imports. Python 3.12 should preload the running command by itself, but its fork server loses
+        the path of that command.
+
+        Args:
+            n_envs: The number of environments.
+            use_async_envs: Whether each environment has its own process.
         """
         commands = [name for name in _COMMANDS if name in sys.modules]
         multiprocessing.get_context("forkserver").set_forkserver_preload([*commands, __name__])
@@ -153,8 +169,13 @@ def _given(text: NameOrPath) -> NameOrPath:
 
 
 class FilmedEnv(ManipEnv):
-    """`ManipEnv` for lerobot-eval, which always films: if `film` is false, its pictures are
-    small and black.
+    """`ManipEnv` for lerobot-eval, which always films.
+
+    Args:
+        config: The options of the environment.
+        film: Whether to render the films; if not, their pictures are small and black.
+        cameras: The cameras that the policy observes; None for none.
+        gymnasiums: Further arguments of `ManipEnv`.
     """
 
     def __init__(
