@@ -128,7 +128,17 @@ class Learnt:
 
 
 def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.Generator) -> Learnt:
-    """Return the weights that a method of `METHODS` infers from one or more demonstrations."""
+    """Return the weights that a method infers from demonstrations.
+
+    Args:
+        method: One of `METHODS`.
+        demonstrations: One or more demonstrations.
+        rng: Draws the weights whose paths show which features matter, and the samples of
+            `bayesian`.
+
+    Returns:
+        The weights, with credible intervals if the method is `bayesian`.
+    """
     tastes = rng.exponential(bayesian.PRIOR, (_TASTES, demonstrations[0].problem.features.shape[1]))
     unknown = tuple(open_features(demonstrations, rivals(demonstrations, tastes)))
     if method == "bayesian":

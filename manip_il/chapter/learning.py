@@ -104,11 +104,18 @@ def airl(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
 def ppo(
     run: LearningRun, c: LearningConfig, reward: Callable[[F32], F32] | None = None
 ) -> Iterator[Result]:
-    """Yield each iteration's result: roll out the agent and improve it with a given reward
-    (Schulman et al. 2017).
+    """Roll out the agent and improve it with a given reward, again and again.
 
-    reward: maps rows of joint state, environment state and absolute action, (N, n + k + n), to
-    rewards (N,); by default the reward in the folder `c.reward`.
+    The method is PPO (Schulman et al. 2017).
+
+    Args:
+        run: The run, which makes the agent and saves its iterations.
+        c: Options of the run.
+        reward: Maps rows of joint state, environment state and absolute action, (N, n + k + n), to
+            rewards (N,); by default the reward in the folder `c.reward`.
+
+    Yields:
+        The result of each iteration.
     """
     reward = reward or LearnedReward.load(c.reward or Path())
     agent = run.agent()

@@ -218,10 +218,19 @@ def write_reward(
     options: Mapping[str, Any],
     fingerprint: Mapping[str, Any],
 ) -> None:
-    """Write a `pretrained_model` folder: config.json, model.safetensors, and its origin,
-    manip_il.json.
+    """Write a reward to a `pretrained_model` folder.
 
-    options: the options of the fit. Raises `OSError` if it cannot be written.
+    The files are config.json, model.safetensors, and manip_il.json with the reward's origin.
+
+    Args:
+        folder: An existing folder; files of these names in it are replaced.
+        network: The fitted networks.
+        spec: The environment whose states and actions the reward takes.
+        options: Options of the fit.
+        fingerprint: Fingerprint of the datasets' environment.
+
+    Raises:
+        OSError: If a file cannot be written.
     """
     origin = Origin.of(spec, fingerprint, options)
     config = {"type": PREFERENCE, **asdict(network.shape)}

@@ -121,10 +121,13 @@ class Bus:
     def show(
         self, q: F64, velocity: ArrayLike = 0.0, load: ArrayLike = 0.0, *, settled: bool = False
     ) -> None:
-        """Set what the servos measure, (n,): angle [rad], velocity [rad/s], load as a share of
-        stall torque, -1 to 1.
+        """Set what the servos measure.
 
-        settled: also set their goals to these angles.
+        Args:
+            q: Encoder angles [rad], (n,).
+            velocity: Velocities [rad/s], (n,) or one for all.
+            load: Loads as shares of the stall torque, -1 to 1, (n,) or one for all.
+            settled: Whether to set the servos' goals to these angles, too.
         """
         with self.lock:
             self["Present_Position"] = encoder_steps(q) - self["Homing_Offset"]

@@ -145,7 +145,19 @@ def summary_lines(found: FittedReward, answers: Answers) -> list[str]:
 
 
 def deal(pair: I64, folds: int, seed: int) -> I64:
-    """Return the fold of every answer, (A,); all answers about a pair are in the same fold."""
+    """Return the fold of every answer; all answers about a pair are in the same fold.
+
+    Args:
+        pair: Number of the pair that each answer is about, (A,).
+        folds: Number of folds.
+        seed: Seed of the order in which pairs are dealt to the folds.
+
+    Returns:
+        Numbers of the folds, 0 to `folds` - 1, (A,).
+
+    Raises:
+        ManipError: If fewer pairs than folds have an answer.
+    """
     names, place = np.unique(pair, return_inverse=True)
     if len(names) < folds:
         raise ManipError(

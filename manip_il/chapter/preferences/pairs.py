@@ -188,9 +188,16 @@ class Pairs:
 
 
 def read_file[Read](path: Path, form: str, make: Callable[[dict[str, Any]], Read]) -> Read:
-    """Return `make(content)` for a JSON file of a format.
+    """Return what a JSON file of a format describes.
 
-    Raises `ManipError` for any other file.
+    Args:
+        path: The file.
+        form: Name of the format, which the file states as its `format`.
+        make: Turns the file's content into the result.
+
+    Raises:
+        ManipError: If the file cannot be read, has another format or version, or has content that
+            `make` rejects.
     """
     data = checks.read_json(path, form)
     with in_one_line(f"{path} holds no {form}"):
@@ -274,7 +281,8 @@ def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
             by their hashes.
         roots: Datasets that the user named, in any order, at least those of the pairs.
 
-    Raises `ManipError` if a dataset of the pairs is missing or has changed since.
+    Raises:
+        ManipError: If a dataset of the pairs is missing or has changed since.
     """
     found = {dataset_sha256(root): root for root in roots}
     for source in pairs.sources:
@@ -294,14 +302,26 @@ def choose_pairs(
     rng: np.random.Generator,
     reward: LearnedReward | None = None,
 ) -> Clips:
-    """Choose pairs of clips of `length` control steps from datasets.
+    """Choose pairs of clips from datasets.
 
-    Episodes shorter than a clip are ignored.
+    Episodes shorter than a clip are ignored. With `reward`, `POOL` times as many pairs are drawn,
+    and those are kept on which its networks disagree most, by the standard deviation of P(left is
+    better) (Christiano et al. 2017, section 2.2.4; Lee et al. 2021).
 
-    With `reward`, draw `POOL` times as many pairs, and keep those on which its networks disagree
-    most, by the standard deviation of P(left is better) (Christiano et al. 2017, section 2.2.4; Lee
-    et al. 2021). Raises `MismatchError` unless datasets and reward have the same task, `ManipError`
-    if there are too few pairs.
+    Args:
+        roots: Folders of the datasets.
+        length: Control steps of a clip.
+        count: Number of pairs.
+        seed: Seed that is stored with the pairs; it draws nothing itself.
+        rng: Draws the pairs.
+        reward: The reward whose networks choose among the drawn pairs, if any.
+
+    Returns:
+        The pairs with the frames of their datasets.
+
+    Raises:
+        MismatchError: If datasets and reward do not all have the same task and columns.
+        ManipError: If no episode is as long as a clip, or there are too few different pairs.
     """
     frames = tuple(read_all(roots))
     longest = max(int(one.lengths.max()) for one in frames)
@@ -515,6 +535,15 @@ TEACHERS = {
 
 
 def answer_pairs(teacher: Teacher, clips: Clips, rng: np.random.Generator) -> Preferences:
-    """Return a teacher's preferences about the pairs, reproducible from the state of `rng`."""
+    """Return a simulated teacher's answers about all pairs.
+
+    Args:
+        teacher: The teacher.
+        clips: The pairs, with datasets that have a progress column.
+        rng: Draws the teacher's choices and mistakes; the same state gives the same answers.
+
+    Raises:
+        ManipError: If a dataset has no progress column.
+    """
     answers = [Answer(number, one) for number, one in enumerate(teacher.answers(clips, rng))]
     return Preferences(clips.pairs.sha256, f"teacher {teacher.name}", tuple(answers))

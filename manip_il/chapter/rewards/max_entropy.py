@@ -114,9 +114,19 @@ def _sum_paths(problem: PathProblem, shares: F64) -> F64:
 def loss_of(
     demonstrations: Sequence[Demonstration], weights: F64, prior: float = PRIOR
 ) -> tuple[float, F64]:
-    """Return the negative log-posterior per demonstration and its gradient (K,).
+    """Return the negative log-posterior per demonstration and its gradient.
 
-    Raises what `soft_plan` raises.
+    Args:
+        demonstrations: One or more demonstrations.
+        weights: The weights, (K,) [1/m].
+        prior: Standard deviation of the weights' normal prior [1/m].
+
+    Returns:
+        The loss, up to a constant, and its gradient by the weights, (K,) [m].
+
+    Raises:
+        ManipError: If a demonstration's sum over all paths is infinite (see `soft_plan`), or if its
+            visits cannot be computed (see `SoftPlan.visits`).
     """
     count = len(demonstrations)
     loss = 0.5 * float(weights @ weights) / (prior**2 * count)

@@ -133,11 +133,21 @@ def measure_shift(
     on_episode: OnEpisode = lambda _: None,
     conditions: tuple[Condition, ...] = (),
 ) -> Shift:
-    """Run the expert and every round's policy on the same seeds, and query the expert in every
-    state.
+    """Run the expert and every round's policy on the same seeds.
 
-    conditions: the run's variations of the world. u: the expert's recoverability on `env`, see
-    `certify`.
+    The expert is queried in every state.
+
+    Args:
+        engine: Runs the episodes.
+        env: The environment.
+        rounds: The rounds of a run, see `find_rounds`.
+        u: The expert's recoverability on `env` [control steps], see `certify`.
+        episodes: Episodes of each driver.
+        on_episode: Called with every finished episode.
+        conditions: The run's variations of the world.
+
+    Returns:
+        The rounds' errors in the expert's states and in their own, with costs and bounds.
     """
     seeds, scale = stream_seeds("theory", episodes), described_env(env).actions.scale
     spec, found = env_spec(env), list[RoundShift]()
