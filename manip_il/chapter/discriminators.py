@@ -78,8 +78,10 @@ class Discriminator(nn.Module):
     def reward(self, learner: Transitions, log_probs: F32 | None = None) -> F32:
         """Return the reward of every transition, (N,), clipped to +-10.
 
-        log_probs: the learner's log-density of each action, (N,), if the discriminator
-        `asks_density`.
+        Args:
+            learner: Transitions of the learner.
+            log_probs: The learner's log-density of each action, (N,), if the discriminator
+                `asks_density`.
         """
         with torch.no_grad():
             rewards = self.logits(self._encode(learner, log_probs))

@@ -204,7 +204,11 @@ class Learner:
     def collect(self, seed: int) -> Transitions:
         """Run one episode in every environment.
 
-        Return all steps, grouped by time. seed: see `Lockstep.start`.
+        Args:
+            seed: Seed of the first episode, see `Lockstep.start`.
+
+        Returns:
+            All steps, grouped by time.
         """
         env, buffer = self.env, self.ppo.rollout_buffer
         buffer.reset()

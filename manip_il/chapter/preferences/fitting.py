@@ -46,10 +46,13 @@ class FittedReward:
 
     Each network holds out some of the pairs.
 
-    logits: R(left) - R(right) of every answer, (A,), by the network that held it out. epochs:
-    number of epochs that the networks were trained for. answered: agreement with the answers that
-    are not `equal`; true: agreement with true progress, without pairs that differ by less than
-    `TIE`; None if the datasets have no progress.
+    Attributes:
+        network: The networks.
+        logits: R(left) - R(right) of every answer, by the network that held it out, (A,).
+        epochs: Number of epochs that the networks were trained for.
+        answered: Agreement with the answers that are not `equal`.
+        true: Agreement with true progress, without pairs that differ by less than `TIE`; None if
+            the datasets have no progress.
     """
 
     network: RewardNetwork

@@ -35,8 +35,10 @@ _STEP = 2.38
 class Choices:
     """The paths that the demonstrators chose among, one block of rows per demonstration.
 
-    excess: a path's features minus the demonstration's, (m, K) [m]. A block's first row, zeros, is
-    the demonstration. starts: first row of each block, (D,).
+    Attributes:
+        excess: A path's features minus the demonstration's, (m, K) [m]. A block's first row, zeros,
+            is the demonstration.
+        starts: First row of each block, (D,).
     """
 
     excess: F64

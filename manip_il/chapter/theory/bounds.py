@@ -39,10 +39,14 @@ Learner = Literal["cloning", "DAgger"]
 class Process:
     """S states and two actions; the expert always takes `RIGHT`. Rewards are 0 to 1 per step.
 
-    words: what a wrong action does. moves: transition probabilities (action, from, to), (2, S, S),
-    uniform over the successors. rewards: (2, S). start: distribution of the first state, (S,).
-    slopes: powers of the horizon with which gap over error grows according to the theorems, for
-    cloning and for DAgger.
+    Attributes:
+        name: Name of the process.
+        words: What a wrong action does.
+        moves: Transition probabilities (action, from, to), uniform over the successors, (2, S, S).
+        rewards: Reward of each action in each state, (2, S).
+        start: Distribution of the first state, (S,).
+        slopes: Powers of the horizon with which gap over error grows according to the theorems, for
+            cloning and for DAgger.
     """
 
     name: str
@@ -159,11 +163,15 @@ PROCESSES = (
 
 @dataclass(frozen=True, eq=False)
 class LossCurve:
-    """Losses of a learner at each of h horizons, for each of D draws of its training data: arrays
-    (h, D).
+    """Losses of a learner at each of h horizons, for each of D draws of its training data.
 
-    errors: share of states in which the policy errs; gaps: the expert's return minus the policy's;
-    bounds: upper bounds on the gaps by the learner's theorem.
+    Attributes:
+        problem: Name of the process.
+        learner: The method that fitted the policies.
+        horizons: The h horizons [steps].
+        errors: Share of states in which the policy errs, (h, D).
+        gaps: The expert's return minus the policy's, (h, D).
+        bounds: Upper bounds on the gaps by the learner's theorem, (h, D).
     """
 
     problem: str
