@@ -33,13 +33,21 @@ class PPOConfig:
         check_bounds(self, "ppo.")
 
     def first_lr(self, *, clone: bool) -> float:
-        """Return the initial learning rate. clone: whether the actor starts from a clone."""
+        """Return the initial learning rate.
+
+        Args:
+            clone: Whether the actor starts from a clone.
+        """
         return self.lr if self.lr is not None else 2e-4 if clone else 5e-4
 
     def discount(self, *, clone: bool) -> float:
         """Return gamma.
 
-        By default higher for a clone, as its episodes are long enough to show delayed effects.
+        By default it is higher for a clone, as its episodes are long enough to show delayed
+        effects.
+
+        Args:
+            clone: Whether the actor starts from a clone.
         """
         return self.gamma if self.gamma is not None else 0.97 if clone else 0.9
 
@@ -62,11 +70,17 @@ class DiscriminatorConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LearningConfig(Seeded):
-    """Options of a reinforcement learning run. method: `gail`, `airl` or `ppo`. datasets:
-    demonstrations.
+    """Options of a reinforcement learning run.
 
-    start, reward: `pretrained_model` folders of the policy to start from and, for `ppo`, of the
-    reward. Raises `UsageError` for a number out of range.
+    Attributes:
+        method: `gail`, `airl` or `ppo`.
+        env: The environment.
+        datasets: Folders of the demonstrations.
+        start: `pretrained_model` folder of the policy to start from, if any.
+        reward: `pretrained_model` folder of the reward, for `ppo`.
+
+    Raises:
+        UsageError: If a number is out of range.
     """
 
     method: str

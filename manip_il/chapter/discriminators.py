@@ -35,9 +35,9 @@ Batch = tuple[Tensor, ...]  # states (B, e), actions (B, n), next states (B, e),
 class Discriminator(nn.Module):
     """A discriminator, its optimiser and its input scales.
 
-    network: the actor, whose statistics scale the inputs. gamma: discount in AIRL's f; None for
-    GAIL's form. asks_density: whether the logit depends on the learner's log-density of the action,
-    as in AIRL.
+    Attributes:
+        asks_density: Whether the logit depends on the learner's log-density of the action, as in
+            AIRL.
     """
 
     mean: Tensor
@@ -48,6 +48,13 @@ class Discriminator(nn.Module):
     def __init__(
         self, config: DiscriminatorConfig, network: MLPNetwork, gamma: float | None = None
     ) -> None:
+        """Make an untrained discriminator.
+
+        Args:
+            config: Its sizes and the options of its optimiser.
+            network: The actor, whose statistics scale the inputs.
+            gamma: Discount per control step in AIRL's f; None for GAIL's form.
+        """
         super().__init__()
         self.config, self.asks_density = config, gamma is not None
         for name, value in (("mean", network.input_mean), ("scale", network.input_scale)):
@@ -71,8 +78,10 @@ class Discriminator(nn.Module):
     def reward(self, learner: Transitions, log_probs: F32 | None = None) -> F32:
         """Return the reward of every transition, (N,), clipped to +-10.
 
-        log_probs: the learner's log-density of each action, (N,), if the discriminator
-        `asks_density`.
+        Args:
+            learner: Transitions of the learner.
+            log_probs: The learner's log-density of each action, (N,), if the discriminator
+                `asks_density`.
         """
         with torch.no_grad():
             rewards = self.logits(self._encode(learner, log_probs))
@@ -87,10 +96,16 @@ class Discriminator(nn.Module):
     ) -> dict[str, float]:
         """Take an iteration's gradient steps.
 
-        Return the mean loss, and the initial accuracies on expert and learner.
+        Args:
+            expert: Transitions of the demonstrations.
+            learner: Transitions of the learner's last episodes.
+            log_probs: Log-densities, under the learner's policy, of the expert's and of the
+                learner's actions, (N,) each, if the discriminator `asks_density`; else None.
+            rng: Draws the batches and the points of the gradient penalty.
 
-        log_probs: the log-densities, under the learner's policy, of the expert's and of the
-        learner's actions, (N,) each, if the discriminator `asks_density`.
+        Returns:
+            The mean `loss`, and the accuracies before the first step, `accuracy_expert` and
+            `accuracy_learner`.
         """
         data = [
             self._encode(one, log)

@@ -42,8 +42,10 @@ from manip_il.worlds.table import make_env
 class Transitions:
     """Steps of episodes, N rows.
 
-    states, next_states: (N, d + 1), raw inputs and the flag of the absorbing state.
-    actions: (N, n), normalised as for the policy's head, clipped to their range.
+    Attributes:
+        states: Raw inputs and the flag of the absorbing state, (N, d + 1).
+        actions: Actions, normalised as for the policy's head and clipped to their range, (N, n).
+        next_states: The states one step later, (N, d + 1).
     """
 
     states: F32
@@ -61,11 +63,13 @@ class Transitions:
 
 @dataclass(frozen=True, eq=False)
 class Demonstrations:
-    """Whole episodes of the expert: raw inputs (T, d) and targets (T, n) of each, in a policy's
-    action space.
+    """Whole episodes of the expert, in a policy's action space.
 
-    hold: steps from success to the end; None for episodes that do not end, as in a benchmark's
-    environments.
+    Attributes:
+        inputs: Raw inputs of each episode, (T, d).
+        targets: Raw targets of each episode, (T, n).
+        hold: Control steps from success to the end; None for episodes that do not end, as in a
+            benchmark's environments.
     """
 
     inputs: tuple[F32, ...]
@@ -85,8 +89,12 @@ class Demonstrations:
     def padded(self, steps: int, encode: Callable[[F32], F32]) -> Transitions:
         """Return all episodes, each padded to `steps` transitions, or not padded if `hold` is None.
 
-        encode: normalises raw targets (T, n). Raises `UsageError` if an episode is longer than
-        `steps`.
+        Args:
+            steps: Transitions of a padded episode.
+            encode: Normalises raw targets (T, n).
+
+        Raises:
+            UsageError: If an episode is longer than `steps`.
         """
         if self.longest > steps:
             raise UsageError(
@@ -106,12 +114,19 @@ class Demonstrations:
 def read_demonstrations(
     roots: Sequence[Path], encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 ) -> Demonstrations:
-    """Read the expert's whole episodes from datasets. encode: `Conversion.encode` for actions (T,
-    n), states (T, n).
+    """Read the expert's whole episodes from datasets.
 
-    Skips episodes in which a learner drove at some step or a label is invalid, and those that
-    failed. Raises `NothingToLearnError` if none is left, `NotFiniteError`, and what
-    `joined_columns` raises.
+    Episodes in which a learner drove at some step or a label is invalid are skipped, and so are
+    those that failed.
+
+    Args:
+        roots: Folders of the datasets.
+        encode: `Conversion.encode`, for actions (T, n) and states (T, n).
+
+    Raises:
+        NothingToLearnError: If no episode is left.
+        NotFiniteError: If a number is not finite.
+        ManipError: If a dataset cannot be read, see `joined_columns`.
     """
     observed = (STATE, ENVIRONMENT_STATE, ACTION)
     table = joined_columns(roots, [*observed, EPISODE_INDEX, LABEL_VALID, ACTOR, SUCCESS])
@@ -136,13 +151,18 @@ def read_demonstrations(
 
 
 class RobotEpisode:
-    """An episode of our environment, which is simulated only: no state is stored and no expert is
-    queried.
+    """An episode of our environment, which is simulated only.
 
-    hold: control steps from success to the end; None: success does not end it.
+    No state is stored and no expert is queried.
     """
 
     def __init__(self, config: EnvConfig, hold: int | None):
+        """Make the environment.
+
+        Args:
+            config: The environment.
+            hold: Control steps from success to the end; None if success does not end the episode.
+        """
         self._env, self._hold = make_env(config), hold
         self._held = 0
 
@@ -175,9 +195,15 @@ class RobotEpisode:
 
 @dataclass(frozen=True)
 class ActionRange:
-    """Mean, scale and range of raw targets, (n,) each.
+    """Mean, scale and range of raw targets.
 
-    A normalised action y stands for mean + scale y, clipped.
+    A normalised action y is converted to the target mean + scale y, clipped to the range.
+
+    Attributes:
+        mean: Mean, (n,).
+        scale: Scale, (n,).
+        low: Lower end of the range, (n,).
+        high: Upper end of the range, (n,).
     """
 
     mean: F32
@@ -214,9 +240,12 @@ class Lockstep:
 
     They never end, but continue in the absorbing state.
 
-    Observations (B, d + 2): inputs, the flag of the absorbing state, the elapsed share of
-    `horizon`. simulated: control steps of all episodes since `start`, without absorbing states.
-    executed: actions (B, n) of every step since `start`.
+    Observations are (B, d + 2): inputs, the flag of the absorbing state, and the elapsed share of
+    `horizon`.
+
+    Attributes:
+        simulated: Control steps of all episodes since `start`, without absorbing states.
+        executed: Actions of every step since `start`, (B, n) each.
     """
 
     def __init__(

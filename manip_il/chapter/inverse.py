@@ -50,7 +50,14 @@ _PANELS = 3
 
 @dataclass(frozen=True)
 class Carried:
-    """The path of an episode's object. positions: from its start to the goal, (T, 3) [m]."""
+    """The path of an episode's object.
+
+    Attributes:
+        episode: Number of the episode.
+        grid: The grid over the episode's layout.
+        positions: Positions of the object from its start to the goal, (T, 3) [m].
+        demonstration: The path on the grid.
+    """
 
     episode: int
     grid: Grid
@@ -117,8 +124,11 @@ def carried_stretch(positions: F64, goal: F64) -> F64:
 class Learnt:
     """The weights that a method found.
 
-    weights: (K,), divided by the weight of length. open: indices of the weights that are not
-    identified, see `open_features`. intervals: the weights' credible intervals, (K, 2), or None.
+    Attributes:
+        method: One of `METHODS`.
+        weights: The weights, divided by the weight of length, (K,).
+        open: Indices of the weights that are not identified, see `open_features`.
+        intervals: The weights' credible intervals, (K, 2), or None.
     """
 
     method: str
@@ -128,7 +138,17 @@ class Learnt:
 
 
 def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.Generator) -> Learnt:
-    """Return the weights that a method of `METHODS` infers from one or more demonstrations."""
+    """Return the weights that a method infers from demonstrations.
+
+    Args:
+        method: One of `METHODS`.
+        demonstrations: One or more demonstrations.
+        rng: Draws the weights whose paths show which features matter, and the samples of
+            `bayesian`.
+
+    Returns:
+        The weights, with credible intervals if the method is `bayesian`.
+    """
     tastes = rng.exponential(bayesian.PRIOR, (_TASTES, demonstrations[0].problem.features.shape[1]))
     unknown = tuple(open_features(demonstrations, rivals(demonstrations, tastes)))
     if method == "bayesian":
@@ -140,7 +160,13 @@ def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.G
 
 @dataclass(frozen=True)
 class Inverse:
-    """Learnt weights and the paths that they were learnt from. source: the dataset, in words."""
+    """Learnt weights and the paths that they were learnt from.
+
+    Attributes:
+        source: The dataset, in words.
+        carried: The demonstrated paths.
+        learnt: The weights.
+    """
 
     source: str
     carried: tuple[Carried, ...]

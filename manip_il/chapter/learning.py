@@ -104,11 +104,18 @@ def airl(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
 def ppo(
     run: LearningRun, c: LearningConfig, reward: Callable[[F32], F32] | None = None
 ) -> Iterator[Result]:
-    """Yield each iteration's result: roll out the agent and improve it with a given reward
-    (Schulman et al. 2017).
+    """Roll out the agent and improve it with a given reward, again and again.
 
-    reward: maps rows of joint state, environment state and absolute action, (N, n + k + n), to
-    rewards (N,); by default the reward in the folder `c.reward`.
+    The method is PPO (Schulman et al. 2017).
+
+    Args:
+        run: The run, which makes the agent and saves its iterations.
+        c: Options of the run.
+        reward: Maps rows of joint state, environment state and absolute action, (N, n + k + n), to
+            rewards (N,); by default the reward in the folder `c.reward`.
+
+    Yields:
+        The result of each iteration.
     """
     reward = reward or LearnedReward.load(c.reward or Path())
     agent = run.agent()
@@ -123,7 +130,11 @@ METHODS = {"gail": gail, "airl": airl, "ppo": ppo}
 
 
 class LearningRun(Run):
-    """One run of GAIL, AIRL or PPO in a folder. config: a `LearningConfig`."""
+    """One run of GAIL, AIRL or PPO in a folder.
+
+    Attributes:
+        config: A `LearningConfig`.
+    """
 
     @override
     def results(self) -> Iterator[Result]:
@@ -202,12 +213,27 @@ class LearningRun(Run):
 class Agent:
     """An mlp with its own environments, and the demonstrations that it imitates, if any.
 
-    number, simulated: iterations and control steps so far; metrics: of the last iteration.
-    validated_at: control steps at the last validation. Raises what `start_conversion` and
-    `read_demonstrations` raise, and `UsageError` for options that do not fit the demonstrations.
+    Attributes:
+        number: Iterations so far.
+        simulated: Control steps so far.
+        metrics: Metrics of the last iteration.
+        validated_at: Control steps at the last validation.
     """
 
     def __init__(self, config: LearningConfig, clock: Stopwatch):
+        """Make the policy, its environments and its optimiser; read the demonstrations.
+
+        Args:
+            config: Options of the run.
+            clock: Measures the time that iterations take.
+
+        Raises:
+            UsageError: If options do not fit each other, the policy to start from, or the
+                demonstrations.
+            MismatchError: If the policy to start from has another robot, task or action space.
+            NothingToLearnError: If no demonstration is left, see `read_demonstrations`.
+            NotFiniteError: If a number in the demonstrations is not finite.
+        """
         self.config, self._clock = config, clock
         self.number = self.simulated = self.validated_at = 0
         self.metrics: dict[str, float] = {}
@@ -240,7 +266,11 @@ class Agent:
         )
 
     def discriminator(self, gamma: float | None = None) -> Discriminator:
-        """Return a discriminator, which is saved with the agent. gamma: see `Discriminator`."""
+        """Return a discriminator, which is saved with the agent.
+
+        Args:
+            gamma: Discount per control step in AIRL's f; None for GAIL's form.
+        """
         seed_generators(self._stream("discriminator"))
         made = Discriminator(self.config.discriminator, self._policy.model, gamma)
         self._modules["discriminator"] = made

@@ -71,6 +71,18 @@ class ActorCritic(nn.Module):
         network: MLPNetwork,
         **_: Any,
     ) -> None:
+        """Make the critic and the optimiser.
+
+        stable-baselines3 calls this with its own arguments, of which only the learning rate is
+        used.
+
+        Args:
+            _spaces: Observation space, which the sizes of the network make redundant.
+            _action_space: Action space, likewise.
+            lr: Maps the share of the run that is left to the learning rate; the optimiser starts at
+                `lr(1)`.
+            network: The actor.
+        """
         super().__init__()
         self.actor = network
         self.critic = perceptron(network.input_mean.shape[0] + EXTRA, _WIDTH, 2, 1, nn.Tanh)
@@ -192,7 +204,11 @@ class Learner:
     def collect(self, seed: int) -> Transitions:
         """Run one episode in every environment.
 
-        Return all steps, grouped by time. seed: see `Lockstep.start`.
+        Args:
+            seed: Seed of the first episode, see `Lockstep.start`.
+
+        Returns:
+            All steps, grouped by time.
         """
         env, buffer = self.env, self.ppo.rollout_buffer
         buffer.reset()
@@ -215,12 +231,16 @@ class Learner:
     def improve(
         self, rewards: F32, *, actor: bool = True, remaining: float = 1.0
     ) -> dict[str, float]:
-        """Take an iteration's gradient steps, given the rewards (N,) of the steps from `collect`.
+        """Take an iteration's gradient steps.
 
-        Returns metrics.
+        Args:
+            rewards: Rewards of the steps from `collect`, (N,).
+            actor: Whether to update the actor as well as the critic.
+            remaining: Share of the run that is left, 0 to 1; the learning rate is multiplied by it,
+                but by no less than `LAST_LR`.
 
-        actor: whether to update the actor as well as the critic. remaining: share of the run that
-        is left; the learning rate is multiplied by it, but by no less than `LAST_LR`.
+        Returns:
+            Metrics: `kl`, `value_loss`, `explained_variance`, and the mean `log_std`.
         """
         buffer = self.ppo.rollout_buffer
         buffer.rewards[:] = rewards.reshape(buffer.rewards.shape)
@@ -334,8 +354,16 @@ def start_policy(
 
 
 def save_policy(policy: MLPPolicy, conversion: Conversion, folder: Path) -> None:
-    """Write configuration, weights and processors of an mlp to a new folder, in LeRobot's
-    layout.
+    """Write the configuration, weights and processors of an mlp in LeRobot's layout.
+
+    Args:
+        policy: The policy.
+        conversion: Turns the policy's raw targets into actions; saved as steps of the processors if
+            they do it for this type of policy.
+        folder: Folder to make.
+
+    Raises:
+        FileExistsError: If `folder` exists.
     """
     folder.mkdir()
     policy.save_pretrained(folder)

@@ -36,14 +36,17 @@ _ROWS = 16_384  # rows evaluated at a time
 
 @dataclass(frozen=True)
 class RewardShape:
-    """Sizes of the networks. members: networks in the ensemble; width: units per layer.
+    """Sizes of the networks.
 
-    depth: hidden layers.
-
-    ways: for each offset between two things [m], its input columns: x, y and z, or x and y. The
-    logarithm of the offset's length is an input, too, so that the last centimetres count as much as
-    the first decimetres. Progress mostly depends on distances, and a few hundred answers are too
-    few to learn a square root from. unread: input columns that the networks do not use.
+    Attributes:
+        members: Networks in the ensemble.
+        width: Units per layer.
+        depth: Hidden layers.
+        ways: For each offset between two things [m], its input columns: x, y and z, or x and y. The
+            logarithm of the offset's length is an input, too, so that the last centimetres count as
+            much as the first decimetres. Progress mostly depends on distances, and a few hundred
+            answers are too few to learn a square root from.
+        unread: Input columns that the networks do not use.
     """
 
     members: int = 8
@@ -93,8 +96,13 @@ class RewardNetwork(nn.Module):
     """M perceptrons from (state, environment state, action) to a reward.
 
     Inputs are standardised and clamped to `CLAMP` standard deviations, so that states far from the
-    data have the reward at the bound. `low`, `high`: mean rewards of the M perceptrons that
-    `forward` maps to 0 and 1.
+    data have the reward at the bound.
+
+    Attributes:
+        mean: Mean of each input of the perceptrons.
+        std: Standard deviation of each input of the perceptrons.
+        low: Mean reward of the M perceptrons that `forward` maps to 0.
+        high: Mean reward of the M perceptrons that `forward` maps to 1.
     """
 
     CLAMP = 5.0
@@ -105,6 +113,12 @@ class RewardNetwork(nn.Module):
     high: Tensor
 
     def __init__(self, inputs: int, shape: RewardShape) -> None:
+        """Make networks whose weights are all zero; `initialise` draws them.
+
+        Args:
+            inputs: Number of input columns.
+            shape: Sizes of the networks.
+        """
         super().__init__()
         self.shape = shape
         self.ways = [list(way) for way in shape.ways]
@@ -159,9 +173,13 @@ class RewardNetwork(nn.Module):
 
 
 class LearnedReward:
-    """A reward learnt from preferences. origin: robot, task and columns that it is for.
+    """A reward learnt from preferences.
 
     It is about 0 for the worst and 1 for the best of the states that it was trained on.
+
+    Attributes:
+        network: The networks.
+        origin: Robot, task and columns that the reward is for.
     """
 
     def __init__(self, network: RewardNetwork, origin: Origin) -> None:
@@ -185,8 +203,11 @@ class LearnedReward:
         return cls(network, origin)
 
     def check_fits(self, name: str, spec: EnvironmentSpec) -> None:
-        """Raise `MismatchError` unless `spec` has this reward's task and columns. name: what
-        messages call `spec`.
+        """Raise `MismatchError` unless `spec` has this reward's task and columns.
+
+        Args:
+            name: What messages call `spec`.
+            spec: The environment.
         """
         if self.origin.task != spec.task:
             raise MismatchError("task", "the reward", self.origin.task, name, spec.task)
@@ -203,7 +224,11 @@ class LearnedReward:
 
     @torch.inference_mode()
     def members(self, inputs: F32) -> F64:
-        """Return every network's reward in log-odds per step, (M, B). inputs: as in `__call__`."""
+        """Return every network's reward in log-odds per step, (M, B).
+
+        Args:
+            inputs: Rows of state, environment state and absolute action, (B, n + k + n).
+        """
         with threads(1):
             parts = [
                 self.network.members(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)
@@ -218,10 +243,19 @@ def write_reward(
     options: Mapping[str, Any],
     fingerprint: Mapping[str, Any],
 ) -> None:
-    """Write a `pretrained_model` folder: config.json, model.safetensors, and its origin,
-    manip_il.json.
+    """Write a reward to a `pretrained_model` folder.
 
-    options: the options of the fit. Raises `OSError` if it cannot be written.
+    The files are config.json, model.safetensors, and manip_il.json with the reward's origin.
+
+    Args:
+        folder: An existing folder; files of these names in it are replaced.
+        network: The fitted networks.
+        spec: The environment whose states and actions the reward takes.
+        options: Options of the fit.
+        fingerprint: Fingerprint of the datasets' environment.
+
+    Raises:
+        OSError: If a file cannot be written.
     """
     origin = Origin.of(spec, fingerprint, options)
     config = {"type": PREFERENCE, **asdict(network.shape)}

@@ -56,14 +56,23 @@ Calibration = dict[str, dict[str, int]]
 class Bus:
     """Servos on a pseudo-terminal; a thread of their own answers packets.
 
-    calibration: the registers that the servos keep without power, by joint name. bus[NAME]: values
-    of one register of all servos, (n,), by LeRobot's NAME. path: device file, for any program that
-    uses serial ports. lock: held while a packet is answered; hold it to read several registers at
-    the same moment. commands: number of sync writes received. on_read: called when one packet reads
-    the positions of several servos, which a client does once per control step.
+    `bus[NAME]` has the values of one register of all servos, (n,), by LeRobot's NAME.
+
+    Attributes:
+        path: Device file, for any program that uses serial ports.
+        memory: Memory of each servo as bytes, (n, 96).
+        lock: Held while a packet is answered; hold it to read several registers at the same moment.
+        commands: Number of sync writes received.
+        on_read: Called when one packet reads the positions of several servos, which a client does
+            once per control step.
     """
 
     def __init__(self, calibration: Calibration):
+        """Open the pseudo-terminal and start the thread.
+
+        Args:
+            calibration: The registers that the servos keep without power, by joint name.
+        """
         self._names = list(calibration)
         self.memory = np.zeros((len(calibration), _SIZE), np.uint8)
         for name, value in _FACTORY.items():
@@ -121,10 +130,13 @@ class Bus:
     def show(
         self, q: F64, velocity: ArrayLike = 0.0, load: ArrayLike = 0.0, *, settled: bool = False
     ) -> None:
-        """Set what the servos measure, (n,): angle [rad], velocity [rad/s], load as a share of
-        stall torque, -1 to 1.
+        """Set what the servos measure.
 
-        settled: also set their goals to these angles.
+        Args:
+            q: Encoder angles [rad], (n,).
+            velocity: Velocities [rad/s], (n,) or one for all.
+            load: Loads as shares of the stall torque, -1 to 1, (n,) or one for all.
+            settled: Whether to set the servos' goals to these angles, too.
         """
         with self.lock:
             self["Present_Position"] = encoder_steps(q) - self["Homing_Offset"]

@@ -24,11 +24,22 @@ _QUALITY = 90  # JPEG quality
 class Cameras:
     """A thread that streams a station's cameras on one port, `RATE` times per second.
 
-    images: camera -> its last picture, RGB (height, width, 3). Raises `UsageError` for a port that
-    is taken, `RenderError` if there is no off-screen OpenGL.
+    Attributes:
+        images: The last picture of each camera, by its name, RGB (height, width, 3).
     """
 
     def __init__(self, station: Station, cameras: CameraConfig, port: int):
+        """Open the port, render the first pictures and start the stream.
+
+        Args:
+            station: The station whose world the cameras show.
+            cameras: Names and picture size of the cameras.
+            port: TCP port on this computer.
+
+        Raises:
+            UsageError: If the port is taken.
+            RenderError: If there is no off-screen OpenGL.
+        """
         self._station, self.config = station, cameras
         self.images: dict[str, Picture] = {}
         self._data = mujoco.MjData(station.env.scene.model)

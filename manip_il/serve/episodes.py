@@ -28,14 +28,27 @@ class ServedEpisodes:
 
     Those to keep are written as journals to a folder, for `manip-il data build`.
 
-    folder: None to write no journals. seed: seed of the stream of worlds, `--seed`; worlds with a
-    journal in the folder are not drawn again. leader: the function that moves the leader. driver:
-    who moves the follower now.
+    Attributes:
+        driver: Who moves the follower now.
     """
 
     def __init__(
         self, station: Station, config: EnvConfig, folder: Path | None, seed: int, leader: Mover
     ):
+        """Prepare the folder and draw the first world.
+
+        Args:
+            station: The station.
+            config: The station's environment.
+            folder: Folder of the journals; None to write none.
+            seed: Seed of the stream of worlds, `--seed`; worlds with a journal in the folder are
+                not drawn again.
+            leader: The function that moves the leader.
+
+        Raises:
+            UsageError: If the folder holds something else, such as journals of `manip-il record`.
+            MismatchError: If the folder's journals are of another robot, task or cameras.
+        """
         self._station = station
         self._env = env_of(config)
         self._leader = leader

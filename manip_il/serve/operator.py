@@ -40,14 +40,24 @@ _HIDDEN = ("DISPLAY", "WAYLAND_DISPLAY")  # without them LeRobot reads its keys 
 class Operator:
     """A program in a terminal of its own, and its simulated operator.
 
-    intervene: how far a policy's targets may differ from the expert's before it is corrected, with
-    LeRobot's DAgger strategy [rad]. failed, solved: episodes so far. status: the program's exit
-    code, once it has ended.
+    Attributes:
+        failed: Number of episodes so far that were not solved.
+        solved: Number of episodes so far that were solved.
+        status: The program's exit code, once it has ended; else None.
     """
 
     def __init__(
         self, command: Sequence[str], station: Station, episodes: ServedEpisodes, intervene: float
     ):
+        """Start the program.
+
+        Args:
+            command: The program and its arguments.
+            station: The station whose ports the program uses.
+            episodes: The station's episodes, which the operator begins and ends.
+            intervene: How far a policy's targets may differ from the expert's before it is
+                corrected, with LeRobot's DAgger strategy [rad].
+        """
         self._station = station
         self._episodes = episodes
         self._intervene = intervene

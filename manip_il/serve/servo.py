@@ -20,10 +20,19 @@ class Follower:
     """The servos of a bus as the motors of a simulated arm, in joint order, the gripper last.
 
     Gravity acts on the arm. A servo whose torque is off keeps its position, as if a hand held it.
-    q: the joints' addresses in `qpos`, (n,). step: time between calls of `command` [s].
+
+    Attributes:
+        q: The joints' addresses in `qpos`, (n,).
     """
 
     def __init__(self, world: World, bus: Bus, step: float):
+        """Connect a bus to an arm; call `reset` before `command`.
+
+        Args:
+            world: The world with the arm.
+            bus: The servos' registers.
+            step: Time between calls of `command` [s].
+        """
         scene, model = world.scene, world.scene.model
         self._world = world
         self._bus = bus

@@ -47,13 +47,24 @@ def serve(
     *,
     trust: bool,
 ) -> None:
-    """Serve a virtual arm until the program of `command` ends, or until Ctrl-C if there is none.
+    """Serve a virtual arm until a program ends, or until Ctrl-C if there is none.
 
-    cameras: the cameras to serve, if any. conditions: how worlds vary. policy: folder of the policy
-    that moves the leader, if any; it must fit environment and cameras. trust: whether the policy's
-    models and code may be loaded. say: called with lines for the user. Raises `UsageError` for a
-    robot without Feetech servos or a port that is taken, `MismatchError` for a policy that does not
-    fit, `RenderError` for a window without a display, `ManipError` if the program failed.
+    Args:
+        env: The environment.
+        config: Options of the session.
+        command: The program and its arguments; empty for none.
+        cameras: The cameras to serve, if any.
+        conditions: How worlds vary.
+        policy: Folder of the policy that moves the leader, if any; it must fit environment and
+            cameras.
+        say: Called with lines for the user.
+        trust: Whether the policy's models and code may be loaded.
+
+    Raises:
+        UsageError: If the robot has no Feetech servos, or the cameras' port is taken.
+        MismatchError: If the policy does not fit.
+        RenderError: If there is no display for the window, or no off-screen OpenGL for the cameras.
+        ManipError: If the program failed.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.setswitchinterval(5e-4)  # [s]: short enough for the threads of the buses to answer in time
@@ -89,8 +100,15 @@ def serve(
 
 
 def described(station: Station, config: SessionConfig, cameras: CameraConfig | None) -> list[str]:
-    """Return lines for the user: the ports, their calibration files, and a `lerobot-record`
-    command to copy.
+    """Return lines for the user about an open session.
+
+    Args:
+        station: The station.
+        config: Options of the session.
+        cameras: The cameras that are served, if any.
+
+    Returns:
+        The ports, their calibration files, and a `lerobot-record` command to copy.
     """
     root, port = config.output_dir, config.camera_port
     size = f"width: {cameras.width}, height: {cameras.height}, fps: {RATE}" if cameras else ""
@@ -116,7 +134,10 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
 def policy_mover(policy: LearnedPolicy, station: Station, cameras: Cameras | None) -> Mover:
     """Return a function that moves the leader as a policy commands.
 
-    The policy sees the cameras' latest pictures.
+    Args:
+        policy: The policy.
+        station: The station of the leader.
+        cameras: The served cameras, if any; the policy sees their latest pictures.
     """
     seed = None
 

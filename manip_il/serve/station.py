@@ -36,8 +36,11 @@ Mover = Callable[[], F64 | None]
 class Read(NamedTuple):
     """The world and the follower when a client reads the follower's position.
 
-    told: the follower's target after `commands` commands. sag: how far the follower hangs below its
-    target. Both are joint angles [rad], (n,).
+    Attributes:
+        state: State of the world.
+        told: The follower's target after `commands` commands, joint angles [rad], (n,).
+        sag: How far the follower hangs below its target, joint angles [rad], (n,).
+        commands: Number of commands that the follower has received.
     """
 
     state: State
@@ -50,14 +53,32 @@ class Station:
     """Two ports, `follower` and `leader`, in a folder, and the simulation behind them.
 
     `NAME.json` beside each port is its calibration in LeRobot's format: the registers that the
-    servos keep without power. on_read: called, from another thread, whenever a client reads the
-    follower's position. mover: called every control step; returns the joints to which the
-    weightless leader moves [rad], (n,), or None if it stays. hand: joint angles at which a hand
-    holds both arms still [rad], (n,), or None. clock: paces the control steps. Raises `UsageError`
-    for a robot without Feetech servos.
+    servos keep without power.
+
+    Attributes:
+        env: The simulated environment.
+        seed: Seed of the current world.
+        clock: Paces the control steps.
+        limits: The servos' joint limits [rad], (n, 2).
+        buses: The servos of `follower` and of `leader`.
+        follower: The follower's servos as motors of the simulated arm.
+        mover: Called every control step; returns the joints to which the weightless leader moves
+            [rad], (n,), or None if it stays.
+        hand: Joint angles at which a hand holds both arms still [rad], (n,), or None.
+        on_read: Called, from another thread, whenever a client reads the follower's position.
+        seen: What the cameras see: `qpos`, `mocap_pos` and `mocap_quat` of MuJoCo.
     """
 
     def __init__(self, env: ManipEnv, config: SessionConfig):
+        """Open the ports and draw the world of seed 0.
+
+        Args:
+            env: The environment to simulate; its motors become servos.
+            config: Options of the session.
+
+        Raises:
+            UsageError: If the robot has no Feetech servos.
+        """
         robot = env.scene.robot
         if robot.lerobot is None or robot.lerobot.robot_type != FEETECH:
             raise UsageError(

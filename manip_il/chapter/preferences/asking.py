@@ -29,10 +29,19 @@ Films = list[list[bytes]]  # MP4s of each pair, left and right
 def render_films(
     clips: Clips, robot: Path | None = None, on_pair: Callable[[], None] = lambda: None
 ) -> Films:
-    """Return MP4s of the left and right clip of every pair.
+    """Return films of the left and right clip of every pair.
 
-    robot: YAML of the sources' robot, if it is not a built-in one. Raises `RenderError` without
-    off-screen OpenGL and `ManipError` for sources whose states cannot be rendered.
+    Args:
+        clips: The pairs, with datasets that hold the simulator's states.
+        robot: YAML of the sources' robot, if it is not a built-in one.
+        on_pair: Called after every pair.
+
+    Returns:
+        MP4s that play in real time, in the order of the pairs.
+
+    Raises:
+        RenderError: If there is no off-screen OpenGL.
+        ManipError: If the states of a source cannot be rendered.
     """
     pairs = clips.pairs
     opened = [open_source(root, robot) for root in clips.roots]
@@ -56,7 +65,16 @@ def render_films(
 
 
 def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
-    """Return the page as one string of HTML."""
+    """Return the page that asks people to compare the clips of every pair.
+
+    Args:
+        pairs: The pairs.
+        instruction: The task in words.
+        films: Films of the pairs, see `render_films`.
+
+    Returns:
+        One string of HTML, which needs no other file.
+    """
     script = (files("manip_il.chapter.preferences") / "templates" / "ask.js").read_text(
         encoding="utf-8"
     )

@@ -46,10 +46,13 @@ class FittedReward:
 
     Each network holds out some of the pairs.
 
-    logits: R(left) - R(right) of every answer, (A,), by the network that held it out. epochs:
-    number of epochs that the networks were trained for. answered: agreement with the answers that
-    are not `equal`; true: agreement with true progress, without pairs that differ by less than
-    `TIE`; None if the datasets have no progress.
+    Attributes:
+        network: The networks.
+        logits: R(left) - R(right) of every answer, by the network that held it out, (A,).
+        epochs: Number of epochs that the networks were trained for.
+        answered: Agreement with the answers that are not `equal`.
+        true: Agreement with true progress, without pairs that differ by less than `TIE`; None if
+            the datasets have no progress.
     """
 
     network: RewardNetwork
@@ -145,7 +148,19 @@ def summary_lines(found: FittedReward, answers: Answers) -> list[str]:
 
 
 def deal(pair: I64, folds: int, seed: int) -> I64:
-    """Return the fold of every answer, (A,); all answers about a pair are in the same fold."""
+    """Return the fold of every answer; all answers about a pair are in the same fold.
+
+    Args:
+        pair: Number of the pair that each answer is about, (A,).
+        folds: Number of folds.
+        seed: Seed of the order in which pairs are dealt to the folds.
+
+    Returns:
+        Numbers of the folds, 0 to `folds` - 1, (A,).
+
+    Raises:
+        ManipError: If fewer pairs than folds have an answer.
+    """
     names, place = np.unique(pair, return_inverse=True)
     if len(names) < folds:
         raise ManipError(

@@ -54,9 +54,14 @@ _ROUNDING = 1e-9  # returns that differ by less than this are equal
 class Frames:
     """The frames of one or more datasets.
 
-    inputs: a reward's, (N, n + k + n): state, environment state and the action as executed.
-    episodes: episode number of each frame, (N,), ascending. progress, success: (N,), None
-    if the dataset has no such column.
+    Attributes:
+        spec: The environment.
+        inputs: Inputs of a reward, (N, n + k + n): state, environment state and the action as
+            executed.
+        episodes: Episode number of each frame, ascending, (N,).
+        progress: True progress at each frame, (N,); None if the dataset has no such column.
+        success: Whether the task is solved at each frame, (N,); None if the dataset has no such
+            column.
     """
 
     spec: EnvironmentSpec
@@ -121,9 +126,13 @@ def find_datasets(folders: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True)
 class Source:
-    """A dataset. root: its folder when the pairs were chosen, for messages alone.
+    """A dataset.
 
-    sha256: `dataset_sha256`.
+    Attributes:
+        root: Its folder when the pairs were chosen, for messages alone.
+        sha256: Its hash, see `dataset_sha256`.
+        episodes: Number of its episodes.
+        frames: Number of its frames.
     """
 
     root: str
@@ -133,8 +142,12 @@ class Source:
 
 
 class Clip(NamedTuple):
-    """The start of a clip: indices of the source, of an episode in it, and of the clip's first
-    frame in the episode.
+    """The start of a clip.
+
+    Attributes:
+        source: Index of the source.
+        episode: Index of an episode in the source.
+        first: Index of the clip's first frame in the episode.
     """
 
     source: int
@@ -146,9 +159,16 @@ class Clip(NamedTuple):
 class Pairs:
     """Pairs of clips, left and right, of equal length, from datasets of one task.
 
-    clip: length of every clip [control steps]. If lengths differed, the reward's constant offset,
-    which comparisons do not determine, would count more often for the longer clip. chosen: how the
-    pairs were chosen, in words.
+    Attributes:
+        robot: Name of the robot.
+        task: Name of the task.
+        control_hz: Control steps per second.
+        clip: Length of every clip [control steps]. If lengths differed, the reward's constant
+            offset, which comparisons do not determine, would count more often for the longer clip.
+        seed: Seed that the pairs were drawn with.
+        chosen: How the pairs were chosen, in words.
+        sources: The datasets.
+        pairs: The left and the right clip of each pair.
     """
 
     robot: str
@@ -188,9 +208,16 @@ class Pairs:
 
 
 def read_file[Read](path: Path, form: str, make: Callable[[dict[str, Any]], Read]) -> Read:
-    """Return `make(content)` for a JSON file of a format.
+    """Return what a JSON file of a format describes.
 
-    Raises `ManipError` for any other file.
+    Args:
+        path: The file.
+        form: Name of the format, which the file states as its `format`.
+        make: Turns the file's content into the result.
+
+    Raises:
+        ManipError: If the file cannot be read, has another format or version, or has content that
+            `make` rejects.
     """
     data = checks.read_json(path, form)
     with in_one_line(f"{path} holds no {form}"):
@@ -201,8 +228,12 @@ def read_file[Read](path: Path, form: str, make: Callable[[dict[str, Any]], Read
 
 @dataclass(frozen=True, eq=False)
 class Clips:
-    """Pairs together with their datasets, in the order of `Pairs.sources`, and the frames of
-    those.
+    """Pairs together with their datasets and the frames of those.
+
+    Attributes:
+        pairs: The pairs.
+        roots: Folders of the datasets, in the order of `Pairs.sources`.
+        frames: Frames of each dataset, in the same order.
     """
 
     pairs: Pairs
@@ -274,7 +305,8 @@ def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
             by their hashes.
         roots: Datasets that the user named, in any order, at least those of the pairs.
 
-    Raises `ManipError` if a dataset of the pairs is missing or has changed since.
+    Raises:
+        ManipError: If a dataset of the pairs is missing or has changed since.
     """
     found = {dataset_sha256(root): root for root in roots}
     for source in pairs.sources:
@@ -294,14 +326,26 @@ def choose_pairs(
     rng: np.random.Generator,
     reward: LearnedReward | None = None,
 ) -> Clips:
-    """Choose pairs of clips of `length` control steps from datasets.
+    """Choose pairs of clips from datasets.
 
-    Episodes shorter than a clip are ignored.
+    Episodes shorter than a clip are ignored. With `reward`, `POOL` times as many pairs are drawn,
+    and those are kept on which its networks disagree most, by the standard deviation of P(left is
+    better) (Christiano et al. 2017, section 2.2.4; Lee et al. 2021).
 
-    With `reward`, draw `POOL` times as many pairs, and keep those on which its networks disagree
-    most, by the standard deviation of P(left is better) (Christiano et al. 2017, section 2.2.4; Lee
-    et al. 2021). Raises `MismatchError` unless datasets and reward have the same task, `ManipError`
-    if there are too few pairs.
+    Args:
+        roots: Folders of the datasets.
+        length: Control steps of a clip.
+        count: Number of pairs.
+        seed: Seed that is stored with the pairs; it draws nothing itself.
+        rng: Draws the pairs.
+        reward: The reward whose networks choose among the drawn pairs, if any.
+
+    Returns:
+        The pairs with the frames of their datasets.
+
+    Raises:
+        MismatchError: If datasets and reward do not all have the same task and columns.
+        ManipError: If no episode is as long as a clip, or there are too few different pairs.
     """
     frames = tuple(read_all(roots))
     longest = max(int(one.lengths.max()) for one in frames)
@@ -373,9 +417,12 @@ def _draw(
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer about a pair. pair: the pair's number. when: time in ISO 8601.
+    """An answer about a pair.
 
-    None if a simulated teacher answered.
+    Attributes:
+        pair: Number of the pair.
+        answer: One of `ANSWERS`.
+        when: Time in ISO 8601; None if a simulated teacher answered.
     """
 
     pair: int
@@ -389,7 +436,13 @@ class Answer:
 
 @dataclass(frozen=True)
 class Preferences:
-    """Answers of one person or teacher. pairs: hash of the pairs that were compared."""
+    """Answers of one person or teacher.
+
+    Attributes:
+        pairs: Hash of the pairs that were compared.
+        who: The person or the teacher.
+        answers: The answers.
+    """
 
     pairs: str
     who: str
@@ -429,11 +482,12 @@ class Preferences:
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """All answers except skips. pair: numbers of the pairs, (A,).
+    """All answers except skips.
 
-    better: the answers as numbers, see `BETTER`, (A,).
-
-    skipped: number of `skip` answers.
+    Attributes:
+        pair: Numbers of the pairs, (A,).
+        better: The answers as numbers, see `BETTER`, (A,).
+        skipped: Number of `skip` answers.
     """
 
     pair: I64
@@ -457,10 +511,12 @@ def join_answers(given: Sequence[Preferences]) -> Answers:
 
 @dataclass(frozen=True)
 class Teacher:
-    """One of `TEACHERS`, with B-Pref's parameters.
+    """A simulated teacher, with B-Pref's parameters.
 
-    temperature: 1 / beta; if 0, the better clip is always chosen. epsilon: share of answers that
-    are reversed.
+    Attributes:
+        name: The teacher as the user wrote it, see `parse`.
+        temperature: 1 / beta; if 0, the better clip is always chosen.
+        epsilon: Share of answers that are reversed.
     """
 
     name: str
@@ -515,6 +571,15 @@ TEACHERS = {
 
 
 def answer_pairs(teacher: Teacher, clips: Clips, rng: np.random.Generator) -> Preferences:
-    """Return a teacher's preferences about the pairs, reproducible from the state of `rng`."""
+    """Return a simulated teacher's answers about all pairs.
+
+    Args:
+        teacher: The teacher.
+        clips: The pairs, with datasets that have a progress column.
+        rng: Draws the teacher's choices and mistakes; the same state gives the same answers.
+
+    Raises:
+        ManipError: If a dataset has no progress column.
+    """
     answers = [Answer(number, one) for number, one in enumerate(teacher.answers(clips, rng))]
     return Preferences(clips.pairs.sha256, f"teacher {teacher.name}", tuple(answers))

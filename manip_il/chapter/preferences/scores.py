@@ -39,9 +39,15 @@ _METADATA = b"reward_model_path"  # the key that LeRobot's own scripts write
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Scores of a dataset. frames: score of each frame, (N,), 0 to 1; reward: the reward's name.
+    """Scores of a dataset.
 
     An episode's score is the mean over its last second: how close to success it ended.
+
+    Attributes:
+        root: Folder of the dataset.
+        reward: Name of the reward.
+        data: Frames of the dataset.
+        frames: Score of each frame, 0 to 1, (N,).
     """
 
     root: str
@@ -118,7 +124,12 @@ def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
 
     Ties count half (Mann and Whitney 1947).
 
-    scores, succeeded: one per episode, (E,). None if all or none succeeded.
+    Args:
+        scores: Scores of the episodes, (E,).
+        succeeded: Whether each episode succeeded, (E,); None if this is unknown.
+
+    Returns:
+        The probability; None if all or none of the episodes succeeded, or if this is unknown.
     """
     if succeeded is None or succeeded.all() or not succeeded.any():
         return None

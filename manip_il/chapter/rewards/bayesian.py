@@ -35,8 +35,10 @@ _STEP = 2.38
 class Choices:
     """The paths that the demonstrators chose among, one block of rows per demonstration.
 
-    excess: a path's features minus the demonstration's, (m, K) [m]. A block's first row, zeros, is
-    the demonstration. starts: first row of each block, (D,).
+    Attributes:
+        excess: A path's features minus the demonstration's, (m, K) [m]. A block's first row, zeros,
+            is the demonstration.
+        starts: First row of each block, (D,).
     """
 
     excess: F64
@@ -88,8 +90,14 @@ class Posterior:
 def fit(
     demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR
 ) -> Posterior:
-    """Return the posterior, given that each demonstration was chosen over the cheapest paths for
-    sampled weights.
+    """Return the posterior of the weights, given the demonstrations.
+
+    Each demonstration is taken as chosen over the cheapest paths for sampled weights.
+
+    Args:
+        demonstrations: One or more demonstrations, with the same K features.
+        rng: Draws the sampled weights and the posterior.
+        prior: Prior mean of a weight [1/m].
     """
     size = demonstrations[0].problem.features.shape[1]
     sums = rivals(demonstrations, rng.exponential(prior, (TASTES, size)))
@@ -106,8 +114,17 @@ def draw_posterior(
     count: int = _DRAWS,
     warm_up: int = _WARM_UP,
 ) -> Posterior:
-    """Return draws of the weights given the choices. prior: mean of a weight [1/m]. count: draws
-    per chain.
+    """Return draws of the weights given the choices.
+
+    Args:
+        choices: The paths that the demonstrators chose among.
+        rng: Draws the starts of the chains and their steps.
+        prior: Prior mean of a weight [1/m].
+        count: Draws per chain.
+        warm_up: Steps of each warm-up; its second half tunes the steps that follow.
+
+    Returns:
+        The draws of all `CHAINS` chains, one chain after the other.
     """
 
     def density(logs: F64) -> F64:
@@ -127,9 +144,17 @@ def draw_posterior(
 
 
 def sample(density: Density, start: F64, root: F64, count: int, rng: np.random.Generator) -> F64:
-    """Return `count` draws, (C, count, K), from each chain; the chains start at `start` (C, K).
+    """Run chains of random-walk Metropolis, all at once.
 
-    root: Cholesky factor of the steps' covariance, (K, K).
+    Args:
+        density: The log-density to sample from, up to a constant.
+        start: First point of each chain, (C, K).
+        root: Cholesky factor of the steps' covariance, (K, K).
+        count: Draws per chain.
+        rng: Draws the steps and decides which are accepted.
+
+    Returns:
+        The draws, (C, count, K).
     """
     chains, size = start.shape
     now, height = start, density(start)

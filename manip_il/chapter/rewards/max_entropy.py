@@ -37,8 +37,10 @@ _MOST_EDGES = 20_000  # edges of the longest path that is summed
 class SoftPlan:
     """Distribution of the paths to a goal.
 
-    values: soft cost-to-go -log Z of every node, (S,), infinite if no path leads to the goal.
-    chances: probability of each edge, given its first node, (E,).
+    Attributes:
+        problem: The graph and its goal.
+        values: Soft cost-to-go -log Z of every node, (S,), infinite if no path leads to the goal.
+        chances: Probability of each edge, given its first node, (E,).
     """
 
     problem: PathProblem
@@ -114,9 +116,19 @@ def _sum_paths(problem: PathProblem, shares: F64) -> F64:
 def loss_of(
     demonstrations: Sequence[Demonstration], weights: F64, prior: float = PRIOR
 ) -> tuple[float, F64]:
-    """Return the negative log-posterior per demonstration and its gradient (K,).
+    """Return the negative log-posterior per demonstration and its gradient.
 
-    Raises what `soft_plan` raises.
+    Args:
+        demonstrations: One or more demonstrations.
+        weights: The weights, (K,) [1/m].
+        prior: Standard deviation of the weights' normal prior [1/m].
+
+    Returns:
+        The loss, up to a constant, and its gradient by the weights, (K,) [m].
+
+    Raises:
+        ManipError: If a demonstration's sum over all paths is infinite (see `soft_plan`), or if its
+            visits cannot be computed (see `SoftPlan.visits`).
     """
     count = len(demonstrations)
     loss = 0.5 * float(weights @ weights) / (prior**2 * count)
@@ -143,11 +155,14 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
 
 
 def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> F64:
-    """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B. prior: their standard
-    deviation [1/m].
+    """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B.
 
     The search starts from weights above `least_weights`. It fits some of the demonstrations first,
     then all of them.
+
+    Args:
+        demonstrations: One or more demonstrations.
+        prior: Standard deviation of the weights' normal prior [1/m].
     """
     least = least_weights(demonstrations)
     weights = np.maximum(2 * least, least.max() / 2)

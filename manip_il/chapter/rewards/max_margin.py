@@ -23,11 +23,23 @@ _EPSILON = 1e-12
 def loss_of(
     demonstration: Demonstration, weights: F64, margin: float = MARGIN
 ) -> tuple[float, F64]:
-    """Return the margin violation of a demonstration for weights (K,), and a subgradient (K,).
+    """Return the margin violation of a demonstration and a subgradient.
 
     The margin of a path is `margin` times the length of its edges that end off the demonstration
-    (Ratliff et al. 2006, with the maximum over paths as in their eq. 7). Costs minus margins are
-    positive if length's weight is 1 or more.
+    (Ratliff et al. 2006, with the maximum over paths as in their eq. 7).
+
+    Args:
+        demonstration: The demonstration.
+        weights: The weights, (K,). Costs minus margins are positive if length's weight is 1 or
+            more.
+        margin: Margin per metre of path off the demonstration.
+
+    Returns:
+        How much the demonstration costs above the cheapest path after margins are subtracted, and a
+        subgradient by the weights, (K,) [m].
+
+    Raises:
+        ManipError: If no path leads from the demonstration's start to the goal.
     """
     problem = demonstration.problem
     off = np.ones(problem.nodes, bool)

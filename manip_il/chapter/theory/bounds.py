@@ -39,10 +39,14 @@ Learner = Literal["cloning", "DAgger"]
 class Process:
     """S states and two actions; the expert always takes `RIGHT`. Rewards are 0 to 1 per step.
 
-    words: what a wrong action does. moves: transition probabilities (action, from, to), (2, S, S),
-    uniform over the successors. rewards: (2, S). start: distribution of the first state, (S,).
-    slopes: powers of the horizon with which gap over error grows according to the theorems, for
-    cloning and for DAgger.
+    Attributes:
+        name: Name of the process.
+        words: What a wrong action does.
+        moves: Transition probabilities (action, from, to), uniform over the successors, (2, S, S).
+        rewards: Reward of each action in each state, (2, S).
+        start: Distribution of the first state, (S,).
+        slopes: Powers of the horizon with which gap over error grows according to the theorems, for
+            cloning and for DAgger.
     """
 
     name: str
@@ -98,10 +102,15 @@ class Process:
         )
 
     def seen(self, policy: F64, count: int, rngs: list[np.random.Generator]) -> NDArray[np.bool_]:
-        """Return whether any of `count` trajectories of each policy (B, H, S) visits a state at a
-        step, (B, H, S).
+        """Return which states are visited by at least one of a policy's trajectories.
 
-        rngs: one for each policy.
+        Args:
+            policy: Probability of a wrong action of each policy, (B, H, S).
+            count: Number of trajectories per policy.
+            rngs: One generator per policy, which draws its trajectories.
+
+        Returns:
+            Whether a state is visited at a step, (B, H, S).
         """
         (batch, horizon, _), leads = policy.shape, self._successors
         now = np.stack([rng.choice(self.states, count, p=self.start) for rng in rngs])
@@ -154,11 +163,15 @@ PROCESSES = (
 
 @dataclass(frozen=True, eq=False)
 class LossCurve:
-    """Losses of a learner at each of h horizons, for each of D draws of its training data: arrays
-    (h, D).
+    """Losses of a learner at each of h horizons, for each of D draws of its training data.
 
-    errors: share of states in which the policy errs; gaps: the expert's return minus the policy's;
-    bounds: upper bounds on the gaps by the learner's theorem.
+    Attributes:
+        problem: Name of the process.
+        learner: The method that fitted the policies.
+        horizons: The h horizons [steps].
+        errors: Share of states in which the policy errs, (h, D).
+        gaps: The expert's return minus the policy's, (h, D).
+        bounds: Upper bounds on the gaps by the learner's theorem, (h, D).
     """
 
     problem: str
@@ -199,7 +212,16 @@ class LossCurve:
 def curves(
     process: Process, horizons: Sequence[int] = HORIZONS, draws: int = DRAWS
 ) -> Iterator[LossCurve]:
-    """Yield the loss curves of cloning and of DAgger on one process."""
+    """Fit cloning and DAgger on one process at each horizon, and measure their losses.
+
+    Args:
+        process: The process.
+        horizons: Numbers of steps of an episode.
+        draws: Number of training sets at each horizon.
+
+    Yields:
+        The loss curve of cloning, then that of DAgger.
+    """
     found: dict[Learner, list[F64]] = {"cloning": [], "DAgger": []}
     for horizon in horizons:
         for learner, policies in _fitted(process, horizon, draws).items():
@@ -209,12 +231,19 @@ def curves(
 
 
 def losses_of(process: Process, learner: Learner, policies: F64) -> F64:
-    """Return error, gap and bound, (3, B), of each policy (B, H, S), as the learner's theorem
-    defines them.
+    """Return the error and gap of each policy, and the bound of the learner's theorem.
 
     The error is measured in the states of the expert (cloning, Theorem 8.1) or the policy (DAgger,
     Theorem 8.2). The gap is the cost of the policy's wrong actions in the states that it visits
     (the performance difference lemma).
+
+    Args:
+        process: The process.
+        learner: The method that fitted the policies; it decides which theorem applies.
+        policies: Probability of a wrong action of each policy, (B, H, S).
+
+    Returns:
+        Error, gap and bound in this order, (3, B).
     """
     horizon, own = policies.shape[1], process.visits(policies) * policies
     gaps = (own * process.wrong_costs(horizon)).sum(axis=(1, 2))
@@ -241,11 +270,18 @@ def clone(process: Process, seen: NDArray[np.bool_]) -> F64:
 def dagger(
     process: Process, seen: NDArray[np.bool_], count: int, rngs: list[np.random.Generator]
 ) -> F64:
-    """Return DAgger's policies (B, H, S): those of the round with the fewest errors in its own
-    states (Definition 8.2).
+    """Return DAgger's policies.
 
-    seen: whether states (B, H, S) have labels from the expert's own trajectories. count:
-    trajectories per round. rngs: see `Process.seen`.
+    Each is the policy of the round with the fewest errors in its own states (Definition 8.2).
+
+    Args:
+        process: The process.
+        seen: Whether states have labels from the expert's own trajectories, (B, H, S).
+        count: Trajectories per round.
+        rngs: One generator per policy, see `Process.seen`.
+
+    Returns:
+        Probability of a wrong action of each policy, (B, H, S).
     """
     best, least = np.empty(seen.shape), np.full(len(seen), np.inf)
     for round_ in range(ROUNDS + 1):

@@ -29,11 +29,13 @@ _LATE = 10  # the growth is measured over this many final steps
 
 @dataclass(frozen=True)
 class Drift:
-    """Distance between a clone's and the expert's states. pole: a in the module's x' = a x + u + w.
+    """Distance between a clone's and the expert's states.
 
-    noise: standard deviation of the noise on demonstrated actions. error: root mean square error of
-    the clone's actions in the expert's states; apart: root mean square distance from the expert's
-    states after each step, (STEPS,).
+    Attributes:
+        pole: The factor a in the module's x' = a x + u + w.
+        noise: Standard deviation of the noise on demonstrated actions.
+        error: Root mean square error of the clone's actions in the expert's states.
+        apart: Root mean square distance from the expert's states after each step, (STEPS,).
     """
 
     pole: float

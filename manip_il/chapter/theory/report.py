@@ -25,8 +25,10 @@ _DATA = "#b9bfc6"
 class Theory:
     """All results.
 
-    curves: of cloning and of DAgger on each of `PROCESSES`, in turn. shift: a run's distribution
-    shift, if a run was given.
+    Attributes:
+        curves: Loss curves of cloning and of DAgger on each of `PROCESSES`, in turn.
+        drifts: Drifts of clones on linear systems.
+        shift: A run's distribution shift, if a run was given.
     """
 
     curves: tuple[LossCurve, ...]

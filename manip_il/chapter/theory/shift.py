@@ -49,13 +49,20 @@ RoundData = tuple[int, Path, tuple[Path, ...]]
 
 @dataclass(frozen=True)
 class RoundShift:
-    """One round's policy. on_expert, on_own: how often it is wrong, as a share of the expert's and
-    of its own states.
+    """One round's policy.
 
-    on_expert: None for a policy on pictures. mistakes: mean number of wrong actions per episode.
-    cost: mean cost; gap: its excess over the expert's cost [control steps]; bound: Theorem 8.2's
-    bound on the gap, u times `mistakes`. data, hand: positions of the hand in the training data and
-    in the policy's rollouts, (N, 3) [m].
+    Attributes:
+        round: Number of the round.
+        success: Success rate of the policy.
+        on_expert: Share of the expert's states in which the policy is wrong; None for a policy on
+            pictures.
+        on_own: Share of its own states in which the policy is wrong.
+        mistakes: Mean number of wrong actions per episode.
+        cost: Mean cost [control steps].
+        gap: Excess of the cost over the expert's [control steps].
+        bound: Theorem 8.2's bound on the gap, u times `mistakes` [control steps].
+        data: Positions of the hand in the training data, (N, 3) [m].
+        hand: Positions of the hand in the policy's rollouts, (N, 3) [m].
     """
 
     round: int
@@ -83,9 +90,13 @@ class RoundShift:
 
 @dataclass(frozen=True)
 class Shift:
-    """A run's rounds. expert_cost: the expert's mean cost.
+    """The distribution shift of a run's rounds.
 
-    u: largest cost seen of one wrong action [control steps].
+    Attributes:
+        env: The environment.
+        expert_cost: The expert's mean cost [control steps].
+        u: Largest cost seen of one wrong action [control steps].
+        rounds: The rounds.
     """
 
     env: EnvConfig
@@ -133,11 +144,21 @@ def measure_shift(
     on_episode: OnEpisode = lambda _: None,
     conditions: tuple[Condition, ...] = (),
 ) -> Shift:
-    """Run the expert and every round's policy on the same seeds, and query the expert in every
-    state.
+    """Run the expert and every round's policy on the same seeds.
 
-    conditions: the run's variations of the world. u: the expert's recoverability on `env`, see
-    `certify`.
+    The expert is queried in every state.
+
+    Args:
+        engine: Runs the episodes.
+        env: The environment.
+        rounds: The rounds of a run, see `find_rounds`.
+        u: The expert's recoverability on `env` [control steps], see `certify`.
+        episodes: Episodes of each driver.
+        on_episode: Called with every finished episode.
+        conditions: The run's variations of the world.
+
+    Returns:
+        The rounds' errors in the expert's states and in their own, with costs and bounds.
     """
     seeds, scale = stream_seeds("theory", episodes), described_env(env).actions.scale
     spec, found = env_spec(env), list[RoundShift]()
