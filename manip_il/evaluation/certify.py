@@ -155,12 +155,24 @@ def certify(
     seed: int = 0,
     on_episode: Callable[[Episode], object] = lambda _: None,
 ) -> Certificate:
-    """Measure the expert on `env` with `cases` episodes per kind of perturbation, on seeds of the
-    stream `certificate`.
+    """Measure how well the expert recovers from perturbations in one environment.
 
     The step of a perturbation is drawn uniformly from those that the undisturbed run takes until
-    the task is solved; from that step on, the expert has a whole horizon to solve it. on_episode:
-    called with every episode as it ends.
+    the task is solved; from that step on, the expert has a whole horizon to solve it.
+
+    Args:
+        engine: What runs the episodes.
+        env: The environment.
+        cases: Number of episodes per kind of perturbation.
+        seed: Selects the episodes' seeds, which are from the stream `certificate`.
+        on_episode: Called with every episode as it ends.
+
+    Returns:
+        The certificate, with one row per kind of perturbation, one for undisturbed episodes and one
+        for noise on every action.
+
+    Raises:
+        ManipError: if the expert solves none of the undisturbed episodes.
     """
     seeds = stream_seeds("certificate", cases, seed)
     rows: list[Row] = []
@@ -203,7 +215,16 @@ def certify(
 
 
 def draw_moment(seed: int, kind: str, steps: int) -> int:
-    """Draw one of the `steps` steps of an undisturbed run, for one kind of perturbation."""
+    """Draw the control step at which an undisturbed run is perturbed, uniformly.
+
+    Args:
+        seed: The episode's seed.
+        kind: The kind of perturbation; each kind has its own random stream.
+        steps: Control steps until the undisturbed run solves the task.
+
+    Returns:
+        The index of the step, from 0 to `steps` - 1.
+    """
     return int(rng_for(seed, f"moment of {kind}").integers(steps))
 
 

@@ -52,9 +52,16 @@ class Figure:
 def drawing(
     columns: int, rows: int = 1, *, size: tuple[float, float], **options: Any
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield a figure and its axes (rows, columns) in the reports' style.
+    """Yield a figure and its axes in the reports' style.
 
-    size: size of one panel [inches]. options: of matplotlib's `Figure.subplots`.
+    Args:
+        columns: Number of panels side by side.
+        rows: Number of panels above each other.
+        size: Width and height of one panel [inches].
+        options: Further arguments of matplotlib's `Figure.subplots`.
+
+    Yields:
+        The figure, and its axes as an array (rows, columns).
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure as Drawn

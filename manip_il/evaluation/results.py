@@ -177,7 +177,16 @@ class EvalResult:
     ) -> EnvConfig:
         """Return the environment of the evaluation.
 
-        robot, task, shape: the user's own files, because results hold only the names of these.
+        The user's own files must be given again, because results hold only their names.
+
+        Args:
+            robot: The user's own robot, if any.
+            task: The user's own task, if any.
+            shape: The user's own mesh of the object, if any.
+
+        Raises:
+            UnknownName: if the robot or the task is not built in and its file is not given.
+            UsageError: if a setting is invalid.
         """
         of, limits = (
             self.settings,
@@ -335,8 +344,17 @@ def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
 
 
 def require_equal(left: str, one: object, right: str, other: object, *names: str) -> None:
-    """Raise `MismatchError` for the first attribute in which two objects differ. left, right:
-    names of the objects.
+    """Check that some attributes of two objects are equal.
+
+    Args:
+        left: Name of the first object, for the message.
+        one: The first object.
+        right: Name of the second object, for the message.
+        other: The second object.
+        names: The attributes to compare, in this order.
+
+    Raises:
+        MismatchError: for the first attribute that differs.
     """
     for name in names:
         ours, theirs = getattr(one, name), getattr(other, name)
@@ -347,8 +365,17 @@ def require_equal(left: str, one: object, right: str, other: object, *names: str
 def require_comparable(
     left: str, one: EvalResult, right: str, other: EvalResult, *more: str
 ) -> None:
-    """Raise `MismatchError` if two evaluations differ in robot, task, a setting, or an attribute
-    named in `more`.
+    """Check that two evaluations agree in robot, task and settings.
+
+    Args:
+        left: Name of the first evaluation, for the message.
+        one: The first evaluation.
+        right: Name of the second evaluation, for the message.
+        other: The second evaluation.
+        more: Further attributes that must agree; they are compared first.
+
+    Raises:
+        MismatchError: for the first difference.
     """
     require_equal(left, one, right, other, *more, "robot", "task")
     require_equal(left, one.settings, right, other.settings, *_SETTINGS)
