@@ -227,11 +227,15 @@ def publish(
     page: Report | None = None,
     options: Any = None,
 ) -> None:
-    """Write a result as JSON, and its report beside it if there is one.
+    """Write a result as JSON, with its report beside it, and print what was found.
 
-    Print its tables, lines and files.
-
-    options: as for `about`.
+    Args:
+        path: The JSON file.
+        content: The result, as plain JSON values.
+        tables: Tables to print.
+        lines: Lines to print below the tables; the names of the written files follow them.
+        page: The report, if there is one.
+        options: The command's options, for the report; see `about`.
     """
     written = [f"result: {path}"]
     write_json(path, content)

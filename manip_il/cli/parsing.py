@@ -55,11 +55,16 @@ def given(
     fixed: Collection[str] = (),
     **own: Any,
 ) -> Any:
-    """Return a field that holds, as a dict (`Given`), those options of the dataclass `cls` that the
-    user gave.
+    """Return a field that holds those options of a dataclass that the user gave.
 
-    only: names of fields, by default all. fixed: those that may not grow when this command is
-    resumed. own: defaults that replace those of `cls`; the dict always holds them.
+    The field is a dict, `Given`.
+
+    Args:
+        cls: The dataclass with the options.
+        prefix: What the options' names begin with, by default the field's name and a dot.
+        only: Names of the options that the command has, by default all.
+        fixed: Names of the options that may not grow when the command is resumed.
+        own: Defaults that replace those of `cls`; the dict always holds them.
     """
     metadata = {"given": cls, "only": only, "fixed": fixed}
     names = {} if prefix is None else {"prefix": prefix}
@@ -121,8 +126,13 @@ class Option:
 def options_of(
     cls: type, base: Any = None, prefix: str = "", path: tuple[str, ...] = ()
 ) -> list[Option]:
-    """Return all options of a dataclass, groups expanded, keyword-only ones last. base: instance
-    with the defaults.
+    """Return all options of a dataclass, with its groups expanded and keyword-only options last.
+
+    Args:
+        cls: The dataclass.
+        base: An instance whose values are the defaults; None for those of the class.
+        prefix: What the options' names begin with.
+        path: Attributes that lead from the command's options to this dataclass.
     """
     found: list[Option] = []
     for one in sorted(dataclasses.fields(cls), key=lambda one: one.kw_only is True):

@@ -157,12 +157,22 @@ def _first_labels(episode: Episode, most: float) -> Episode:
 
 
 def build(journals: Path, root: Path, *, replace: bool = False) -> tuple[Info, int]:
-    """Build a LeRobot dataset from a folder of journals, in seed order, equal to the dataset that
-    `record` writes.
+    """Build a LeRobot dataset from a folder of journals, equal to the one that `record` writes.
 
-    Returns and raises what `Recording.make` does. Also raises `ManipError` if journals are missing
-    or damaged. replace: replace an existing `root`; otherwise raises `FolderExistsError` if `root`
-    is not empty.
+    Args:
+        journals: The folder of journals, which are read in seed order.
+        root: The new folder.
+        replace: Whether to replace an existing dataset.
+
+    Returns:
+        The dataset's info and the number of failed episodes left out.
+
+    Raises:
+        FolderExistsError: if `root` is not empty and `replace` is false.
+        UsageError: if the folder to replace is not a dataset of this program.
+        MismatchError: if the journals differ in robot, task or cameras.
+        NothingToLearnError: if no episode has labels.
+        ManipError: if journals are missing or damaged, or the dataset cannot be written.
     """
     recording = Recording.read(journals)
     if not (paths := list_episodes(journals)):

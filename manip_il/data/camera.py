@@ -203,9 +203,20 @@ def open_video(path: Path, size: tuple[int, int] | None = None) -> InputContaine
 
 
 def read_frames(container: InputContainer, first: int, count: int, fps: float) -> Pictures:
-    """Decode frames `first` to `first + count - 1` of an open video, (count, height, width, 3).
+    """Decode successive frames of an open video.
 
-    Raises `ValueError` if one is missing, and what the decoder raises.
+    Args:
+        container: The video.
+        first: Index of the first frame.
+        count: Number of frames.
+        fps: Rate of the video [frames/s].
+
+    Returns:
+        The pictures, (count, height, width, 3).
+
+    Raises:
+        ValueError: if a frame is missing.
+        av.FFmpegError: if the video cannot be decoded.
     """
     stream = container.streams.video[0]
     tick = stream.time_base or 1  # [s]

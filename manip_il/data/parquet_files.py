@@ -38,9 +38,13 @@ _EPISODE_COLUMNS = re.compile(
 class ParquetFiles:
     """Writes numbered parquet files, one at a time: when a file is full, the next one is started.
 
-    group_rows: least number of rows in a row group; a file's last one may have fewer. A writer
-    keeps a description of every row group in memory until the file is closed, so many small groups
-    would need more memory than the rows.
+    A writer keeps a description of every row group in memory until the file is closed, so many
+    small groups would need more memory than the rows.
+
+    Args:
+        folder: Folder of the dataset.
+        template: The files' path in it, with the fields `chunk_index` and `file_index`.
+        group_rows: Least number of rows in a row group; a file's last one may have fewer.
     """
 
     def __init__(self, folder: Path, template: str, group_rows: int = 1):

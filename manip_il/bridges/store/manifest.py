@@ -187,11 +187,18 @@ def check_path(path: object) -> None:
 
 
 def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, Path]:
-    """Return the files of a dataset or run by their paths in the manifest, except hidden and
-    unfinished ones.
+    """Return the files of a dataset or run by their paths in the manifest.
 
-    journals: include a dataset's `<root>.journals`, as `journals/`, and the journals in a run.
-    Raises `RemoteError` for links.
+    Hidden and unfinished files are left out.
+
+    Args:
+        root: Folder of the dataset or run.
+        kind: Which of them it is.
+        journals: Whether to include a dataset's `<root>.journals`, as `journals/`, and the journals
+            in a run.
+
+    Raises:
+        RemoteError: for a link, unless it is a run's link to its last checkpoint.
     """
     local: dict[str, Path] = {}
     for path in sorted(root.rglob("*")):

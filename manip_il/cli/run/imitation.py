@@ -376,8 +376,14 @@ class StudyPlan(NamedTuple):
 
 
 def run_plan(plan: StudyPlan, root: Path, engine: EngineOptions) -> None:
-    """Run the missing runs, seed by seed, so that a study that is stopped early has runs of
-    every arm.
+    """Run those runs of a study that are missing.
+
+    They are run seed by seed, so that a study that is stopped early has runs of every arm.
+
+    Args:
+        plan: The study.
+        root: Folder of the study, with one folder per arm and training seed.
+        engine: How many workers run the episodes, and where.
     """
     runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
     for number, (name, seed) in enumerate(runs, start=1):
@@ -398,9 +404,15 @@ def run_plan(plan: StudyPlan, root: Path, engine: EngineOptions) -> None:
 
 
 def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False) -> StudyPlan:
-    """Return the study in `path`; raises a one-line `UsageError` if something is invalid.
+    """Return the study in a file.
 
-    training_seeds: replaces the number in the file. trust: `--trust` for every run.
+    Args:
+        path: The YAML file.
+        training_seeds: Number of training seeds, by default that in the file.
+        trust: Whether every run may load models and code that a checkpoint names.
+
+    Raises:
+        UsageError: if something in the file is invalid; the message has one line.
     """
     file = from_yaml(path, StudyFile)
     file = replace(file, training_seeds=training_seeds or file.training_seeds)
