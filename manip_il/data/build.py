@@ -40,14 +40,19 @@ Rollouts = Iterable[tuple[Journal, Episode]]
 
 @dataclass(frozen=True)
 class Recording:
-    """Settings for making a dataset from rollouts, stored as `recording.json` in the folder of
-    their journals.
+    """Settings for making a dataset from rollouts.
 
-    A rollout becomes one episode per part (see `parts`). only_successes: leave out failed episodes.
-    only_labelled: leave out episodes without a valid label. episodes: number of episodes to keep,
-    in seed order; None: all. labels: number of valid labels to keep; later ones have `label_valid`
-    0, and later episodes are left out. provenance: who drove, stored in the dataset. video: fields
-    of `VideoConfig`.
+    They are stored as `recording.json` in the folder of the rollouts' journals. A rollout becomes
+    one episode per part (see `parts`).
+
+    Attributes:
+        only_successes: Whether failed episodes are left out.
+        episodes: Number of episodes to keep, in seed order; None for all.
+        provenance: Who drove; stored in the dataset.
+        video: Fields of `VideoConfig`.
+        only_labelled: Whether episodes without a valid label are left out.
+        labels: Number of valid labels to keep, None for all; later ones have `label_valid` 0, and
+            later episodes are left out.
     """
 
     only_successes: bool = False

@@ -46,8 +46,13 @@ _OPEN_FILMS, _OPEN_TABLES = 32, 4  # video and data files that one process keeps
 
 @dataclass(frozen=True)
 class FrameRange:
-    """Frames `first` to `first + count - 1` of a file: the dataset's rows `row` to `row + count
-    - 1`.
+    """Successive frames of a file, which belong to successive rows of the dataset.
+
+    Attributes:
+        path: The file.
+        first: Index of the first frame in the file.
+        count: Number of frames.
+        row: The dataset's row of the first frame.
     """
 
     path: Path
@@ -60,9 +65,12 @@ class FrameRange:
 class Camera:
     """Pictures of one camera.
 
-    key: its column. fps: [Hz]. size: height and width [pixels]. films: whether pictures are in
-    video files; otherwise they are cells of the data files. parts: ranges that hold every row once,
-    in order.
+    Attributes:
+        key: The camera's column.
+        fps: Rate of the pictures [Hz].
+        size: Height and width [pixels].
+        films: Whether pictures are in video files; otherwise they are cells of the data files.
+        parts: Ranges that hold every row once, in order.
     """
 
     key: str

@@ -45,8 +45,12 @@ _NUMBERED = (layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
 
 @dataclass(frozen=True)
 class Own:
-    """Content of `meta/manip_il.json`: the spec, the environment's fingerprint, and the origin
-    of the episodes.
+    """Content of `meta/manip_il.json`.
+
+    Attributes:
+        spec: The environment's description.
+        fingerprint: The environment's fingerprint.
+        provenance: The origin of the episodes.
     """
 
     spec: s.EnvironmentSpec

@@ -220,9 +220,16 @@ class VideoSpans:
 
 @dataclass(frozen=True)
 class EpisodeTable:
-    """Columns with one entry per episode. start, stop: rows, stop excluded.
+    """Columns with one entry per episode.
 
-    others: values in the columns that LeRobot does not have.
+    Attributes:
+        index: Indices of the episodes.
+        length: Numbers of frames.
+        start: First rows.
+        stop: Last rows plus one.
+        tasks: Texts of the tasks.
+        clips: Column of a camera -> where its episodes are.
+        others: Values in the columns that LeRobot does not have.
     """
 
     index: I64

@@ -38,10 +38,14 @@ Group = Literal["start", "state", "action"]
 
 
 class Case(NamedTuple):
-    """One episode. moment: the control step from which the expert is judged.
+    """One episode of a certificate.
 
-    steps: control steps from the moment until the task is solved; None if not solved within the
-    horizon. undisturbed: the same without the perturbation, if known.
+    Attributes:
+        seed: The episode's seed.
+        moment: The control step from which the expert is judged.
+        steps: Control steps from the moment until the task is solved; None if it is not solved
+            within the horizon.
+        undisturbed: The same without the perturbation, if known.
     """
 
     seed: int
@@ -52,10 +56,16 @@ class Case(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """The cases of one kind. kind, words: its short and full name; horizon: [control steps].
+    """The cases of one kind of perturbation.
 
-    left_out: number of episodes without a case, because the undisturbed run failed, or the
-    perturbation could not be placed or changed nothing.
+    Attributes:
+        group: What is perturbed.
+        kind: Short name of the kind.
+        words: Full name of the kind.
+        cases: The cases, by seed.
+        horizon: Control steps within which the expert must solve the task.
+        left_out: Number of episodes without a case, because the undisturbed run failed, or the
+            perturbation could not be placed or changed nothing.
     """
 
     group: Group
@@ -96,10 +106,15 @@ class Row:
 
 @dataclass(frozen=True)
 class Certificate:
-    """Recoverability of the expert on one robot and task, one row per kind of perturbation.
+    """Recoverability of the expert on one robot and task.
 
-    settings: cases (per kind), seed, horizon [control steps], control_hz, tolerance [m] and
-    success_steps.
+    Attributes:
+        robot: Name of the robot.
+        task: Name of the task.
+        fingerprint: The environment's fingerprint.
+        settings: `cases` (per kind), `seed`, `horizon` [control steps], `control_hz`, `tolerance`
+            [m] and `success_steps`.
+        rows: One row per kind of perturbation.
     """
 
     robot: str

@@ -38,9 +38,12 @@ _STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture in a report. svg: the file's content; words: alternative text.
+    """A picture in a report.
 
-    width: natural width [px].
+    Attributes:
+        svg: Content of the SVG file.
+        words: Alternative text.
+        width: Natural width [px].
     """
 
     svg: bytes

@@ -221,7 +221,14 @@ def open_driver(
 
 @dataclass(frozen=True)
 class Replay:
-    """An episode of an evaluation that was run again. differences: between both runs, in words."""
+    """An episode of an evaluation that was run again.
+
+    Attributes:
+        before: The episode's result in the evaluation.
+        job: What was run again.
+        episode: The episode of this run.
+        differences: Differences between both runs, in words; empty if there are none.
+    """
 
     before: EpisodeResult
     job: RolloutJob

@@ -37,11 +37,16 @@ _KEYS = {
 
 @dataclass(frozen=True, slots=True)
 class EpisodeResult:
-    """One episode: `success` at some time, `success_at_end` at the last frame, `ret` the sum of
-    rewards.
+    """The outcome of one episode.
 
-    steps: control steps until the episode ended. phase_at_end: the expert's name for the phase of
-    the last state. detail: further keys of the JSON object.
+    Attributes:
+        seed: The episode's seed.
+        success: Whether the task was solved at some time.
+        success_at_end: Whether it was solved at the last frame.
+        steps: Control steps until the episode ended.
+        ret: Sum of the rewards.
+        phase_at_end: The expert's name for the phase of the last state.
+        detail: Further keys of the JSON object.
     """
 
     seed: int
@@ -84,10 +89,16 @@ class EpisodeResult:
 class EvalSettings:
     """The settings that two evaluations must share to be comparable, and that reproduce an episode.
 
-    horizon, success_steps: control steps. tolerance: distance to the goal that counts as success
-    [m]. suite: the name of the conditions, which episodes cycle through. hold: control steps after
-    success at which an episode ends, None if it continues to the horizon. object: shape and size of
-    the object to grasp, empty for the task's default.
+    Attributes:
+        horizon: Largest number of control steps of an episode.
+        tolerance: Distance to the goal that counts as success [m].
+        control_hz: Control steps per second [Hz].
+        success_steps: Consecutive control steps within the tolerance that count as success.
+        suite: Name of the conditions.
+        conditions: The conditions, which episodes cycle through.
+        hold: Control steps after success at which an episode ends; None if it continues to the
+            horizon.
+        object: Shape and size of the object to grasp; empty for the task's default.
     """
 
     horizon: int
@@ -143,11 +154,19 @@ _SETTINGS = tuple(field.name for field in fields(EvalSettings))
 class EvalResult:
     """One policy on one robot and task: every episode, and the statistics derived from them.
 
-    policy_sha256: hash of the policy's files, if any. until_width: the interval width at which the
-    evaluation was to stop (intervals are then valid at any stopping time); None if the number of
-    episodes was fixed in advance.
+    Attributes:
+        policy: Name of the policy.
+        robot: Name of the robot.
+        task: Name of the task.
+        fingerprint: The environment's fingerprint.
+        episodes: The episodes' results.
+        settings: The settings that all episodes share.
+        policy_sha256: Hash of the policy's files; empty if there are none.
+        until_width: The interval width at which the evaluation was to stop (intervals are then
+            valid at any stopping time); None if the number of episodes was fixed in advance.
 
-    Raises `ManipError` on construction if there is no episode or a seed occurs twice.
+    Raises:
+        ManipError: if there is no episode, or a seed occurs twice.
     """
 
     policy: str

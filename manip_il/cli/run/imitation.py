@@ -365,8 +365,13 @@ def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
 
 
 class StudyPlan(NamedTuple):
-    """A checked study: options and environment of every arm, and the arm to compare others with,
-    if any.
+    """A study whose options have been checked.
+
+    Attributes:
+        file: The study's file.
+        arms: Name of an arm -> its options.
+        envs: Name of an arm -> its environment.
+        baseline: The arm that the others are compared with; None if the arms have different tasks.
     """
 
     file: StudyFile
