@@ -66,10 +66,12 @@ class Output(Replacing):
     def open(self, *sources: Path, saved: Any = None) -> Generator[Path]:
         """Lock and prepare the folder, and write the options to `config.yaml`.
 
-        A resumed run must have the same ones.
+        A resumed run must have the same options. Raises what `prepare_output` and
+        `check_same_options` raise.
 
-        sources: further inputs, which must not be replaced. saved: options to write in place of the
-        command's. Raises what `prepare_output` and `check_same_options` raise.
+        Args:
+            sources: Further inputs, which must not be replaced.
+            saved: Options to write in place of the command's.
         """
         with self.lock(*sources, saved=saved) as prepare:
             prepare()

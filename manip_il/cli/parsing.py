@@ -73,14 +73,18 @@ def given(
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a command. default: `MISSING` if the user must give a value.
+    """One option of a command.
 
-    path: attributes and keys that lead from the command's options to its value. metadata: `help`,
-    one line; `positional` for a value without a name; `command_line_only` for an option that no
-    file may set; `exists` for a path that must exist, with its prefix on the Hub (`datasets/`);
-    `flag`, the full name; `at_least` and `at_most`; `free` and `grows` for an option that a resumed
-    run may change (see `check_same_options`). is_given: whether it is an option of another class,
-    see `given`.
+    Attributes:
+        name: The dotted name, such as `dataset.root`.
+        path: Attributes and keys that lead from the command's options to its value.
+        type: The type of its value.
+        default: Its default; `MISSING` if the user must give a value.
+        metadata: `help`, one line; `positional` for a value without a name; `command_line_only` for
+            an option that no file may set; `exists` for a path that must exist, with its prefix on
+            the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`; `free` and
+            `grows` for an option that a resumed run may change (see `check_same_options`).
+        is_given: Whether it is an option of another class, see `given`.
     """
 
     name: str  # dotted: `dataset.root`
@@ -302,9 +306,13 @@ class _Value(NamedTuple):
 def parse[T](cls: type[T], words: Sequence[str], command: str = "COMMAND") -> T:
     """Read options from the command line.
 
-    `UsageError` for an unknown name, or an invalid or missing value.
+    Args:
+        cls: The dataclass of the command's options.
+        words: The words after the command's name.
+        command: The command's name, for error messages.
 
-    command: the command's name, for error messages.
+    Raises:
+        UsageError: for an unknown name, or for an invalid or missing value.
     """
     known = {option.name: option for option in options_of(cls)}
     known[CONFIG_PATH] = Option(CONFIG_PATH, (), Path, None, {})
@@ -322,10 +330,16 @@ def from_yaml[T](path: Path, cls: type[T]) -> T:
 def from_layers[T](
     cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str, _Value] | None = None
 ) -> T:
-    """Read options from trees of YAML; later trees override earlier ones, and `words` override all.
+    """Read options from trees of YAML and from words.
 
-    layers: pairs (origin, tree); error messages name the origin. Raises `UsageError` as `parse`
-    does.
+    Args:
+        cls: The dataclass of the options.
+        layers: Pairs (origin, tree), of which later ones override earlier ones; error messages name
+            the origin.
+        words: Name -> value from the command line; they override all trees.
+
+    Raises:
+        UsageError: for an unknown name, or for an invalid or missing value.
     """
     known = {option.name: option for option in options_of(cls)}
     raw = dict[str, _Value]()

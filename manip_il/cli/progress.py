@@ -41,7 +41,13 @@ def say(*lines: str) -> None:
 
 
 def say_next(*words: object, what: str = "next", program: str = "manip-il") -> None:
-    """Print a command to copy, quoted for a shell. what: what it is for. program: whose command."""
+    """Print a command to copy, quoted for a shell.
+
+    Args:
+        words: The words after the program's name.
+        what: What the command is for.
+        program: The program's name.
+    """
     say(f"{what}: {shlex.join([program, *map(str, words)])}")
 
 

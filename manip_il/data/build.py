@@ -247,9 +247,14 @@ def merge_datasets(
 
 
 def choose_episodes(words: Sequence[str], count: int) -> set[int]:
-    """Return the numbers of the chosen episodes among `count`. words: `7`, `0:50` (0 to 49), `50:`.
+    """Return the numbers of the chosen episodes.
 
-    none: all.
+    Args:
+        words: Numbers and ranges such as `7`, `0:50` (0 to 49) and `50:`; all if there are none.
+        count: Number of episodes to choose from.
+
+    Raises:
+        UsageError: if a word is neither a number nor a range in `0:count`.
     """
     chosen: set[int] = set()
     for word in words or [":"]:

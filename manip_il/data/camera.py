@@ -119,12 +119,18 @@ class Camera:
 def decode(
     cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = None
 ) -> NDArray[np.uint8]:
-    """Return all pictures of cameras, decoded with one thread per core, channels first: (N, 3,
-    height, width).
+    """Decode all pictures of some cameras, with one thread per core.
 
-    The array is a memory map of an unnamed temporary file, which is deleted with it. on_frames:
-    called with the number of frames decoded since the last call. Raises `ManipError` if the disk is
-    full.
+    Args:
+        cameras: The cameras, whose pictures all have the same size.
+        on_frames: Called with the number of frames decoded since the last call.
+
+    Returns:
+        The pictures, channels first, (N, 3, height, width): a memory map of an unnamed temporary
+        file, which is deleted with it.
+
+    Raises:
+        ManipError: if the disk is full.
     """
     shape = sum(camera.frames for camera in cameras), 3, *cameras[0].size
     with writing(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:

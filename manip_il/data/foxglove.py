@@ -72,8 +72,11 @@ def joint_states(names: Sequence[str], values: NDArray[Any], times: Times) -> Me
 
 
 def scalars(labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Messages:
-    """Yield one JSON message of labelled numbers per row. rows: T rows of Python numbers, which
-    must be finite.
+    """Yield one JSON message of labelled numbers per row.
+
+    Args:
+        labels: Names of the numbers.
+        rows: T rows of Python numbers, which must be finite.
     """
     for row in rows:
         pairs = zip(labels, row, strict=True)

@@ -111,8 +111,10 @@ class CameraFiles:
             container.close()
 
     def info(self, size: tuple[int, int]) -> dict[str, Any]:
-        """Return the entry of LeRobot's `info.json` for this camera. size: height and width
-        [pixels].
+        """Return the entry of LeRobot's `info.json` for this camera.
+
+        Args:
+            size: Height and width of the pictures [pixels].
         """
         config = self._config
         return {

@@ -84,7 +84,9 @@ def to_figure(drawn: Any, words: str) -> Figure:
 def curve_figures(sides: Sequence[Side], target: float | None = None) -> tuple[Figure, ...]:
     """Draw the validation success of each run of the sides against every cost, one figure each.
 
-    target: drawn as a horizontal line, in [0, 1].
+    Args:
+        sides: The sides.
+        target: Success that is drawn as a horizontal line, in [0, 1].
     """
     figures: list[Figure] = []
     for cost in costs_of(run for side in sides for run in side.histories):

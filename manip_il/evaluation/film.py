@@ -114,7 +114,9 @@ def film_outcomes(
 def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: float) -> bytes:
     """Return an MP4 that browsers play: H.264, 4:2:0.
 
-    frames: at least one, uint8 (height, width, 3); height and width must be even for 4:2:0.
+    Args:
+        frames: At least one RGB picture, uint8 (height, width, 3); height and width must be even.
+        fps: Rate of the video [frames/s].
     """
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:

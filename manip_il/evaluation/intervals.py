@@ -185,10 +185,12 @@ def sign_flip_exact(differences: Sequence[int]) -> float:
     """Return the two-sided p of the hypothesis that both signs of each test episode's difference
     are equally likely.
 
-    differences: right's successes minus left's in an episode, summed over training seeds. Since the
-    sign of this sum is flipped, outcomes of different training seeds in one episode need not be
-    independent. With one training seed this is McNemar's exact test; in general it is Fisher's
-    randomisation test (The Design of Experiments, 1935, section 21).
+    With one training seed this is McNemar's exact test; in general it is Fisher's randomisation
+    test (The Design of Experiments, 1935, section 21). Since the sign of an episode's sum is
+    flipped, outcomes of different training seeds in one episode need not be independent.
+
+    Args:
+        differences: Right's successes minus left's in an episode, summed over training seeds.
     """
     # counts of the sums -total, -total + 2, ..., total of signed differences
     ways = np.array([1], dtype=object)

@@ -109,7 +109,13 @@ class Side:
 
     @classmethod
     def of(cls, name: str, result: EvalResult, **more: Any) -> Side:
-        """Return the side of one evaluation. more: other fields."""
+        """Return the side of one evaluation.
+
+        Args:
+            name: Name of the side.
+            result: The evaluation.
+            more: Other fields.
+        """
         return cls(name, (Member(Path(name), result=result),), **more)
 
     @property
@@ -191,9 +197,11 @@ def require_pair(left: Side, right: Side) -> None:
 def require_same_env(envs: Mapping[str, EnvConfig]) -> EnvConfig:
     """Return the environment that all sides or runs share.
 
-    Raises `MismatchError` for the first difference.
+    Args:
+        envs: Name of a side or run -> its environment.
 
-    envs: name of a side or run -> its environment.
+    Raises:
+        MismatchError: for the first difference.
     """
     (first, env), *others = envs.items()
     for name, other in others:

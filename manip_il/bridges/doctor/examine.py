@@ -28,7 +28,11 @@ _PICTURES = 100  # pictures per camera from which statistics are computed
 def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
     """Return all findings about a folder, [] for a sound dataset. Never raises.
 
-    If the folder is not a dataset, this is the only finding. more: additional checks.
+    If the folder is not a dataset, this is the only finding.
+
+    Args:
+        root: The folder.
+        more: Checks to run in addition to `CHECKS`.
     """
     found: list[Finding] = []
     try:

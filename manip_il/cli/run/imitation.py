@@ -76,9 +76,11 @@ def run_dagger(options: DaggerOptions) -> None:
 
 
 def say_best(folder: Path, words: Sequence[str] = ()) -> None:
-    """Print where a run's report and best policy are, and how to evaluate that.
+    """Print where a run's report and best policy are, and how to evaluate that policy.
 
-    words: options that the policy does not store.
+    Args:
+        folder: Folder of the run.
+        words: Options that the policy does not store.
     """
     best = folder / "best" / "pretrained_model"
     say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
