@@ -64,9 +64,12 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
 
     Yield one line for each repair, or for the reason why one was not possible.
 
-    Nothing is deleted: replaced and moved files are kept in `ROOT.before-repair`. Raises
-    `ManipError` if that exists, if a link leads outside, and while another process uses the
-    dataset. Check the dataset again afterwards.
+    Nothing is deleted: replaced and moved files are kept in `ROOT.before-repair`. Check the dataset
+    again afterwards.
+
+    Raises:
+        ManipError: if `ROOT.before-repair` exists, if a link leads outside, or while another
+            process uses the dataset.
     """
     kept = root.with_name(f"{root.name}.before-repair")
     if kept.exists():
