@@ -1,10 +1,9 @@
 """Write files and folders atomically, and name the path if a disk is full or read-only.
 
-Files with one JSON record per line; a kill truncates at most the last line.
+Some files have one JSON record per line; a kill truncates at most the last line.
 
-Whether this program made a folder, and of which kind it is: known by what it wrote into it.
-
-Everything that replaces, empties or adds to a folder asks here first.
+A folder's content tells whether this program made it, and of which kind it is. Everything that
+replaces, empties or adds to a folder checks this here first.
 """
 
 import contextlib

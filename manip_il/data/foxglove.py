@@ -1,6 +1,6 @@
-"""Encode columns as messages that Foxglove shows without settings, one per frame and topic.
+"""Encode columns as messages that Foxglove shows without settings, and decode pictures.
 
-Decode pictures.
+There is one message per frame and topic.
 
 Schemas: Foxglove's own in protobuf (`JointStates`, `RawImage`, `Log`), LeRobot's scalars in JSON.
 Numbers and pictures keep every bit. Pictures are stored raw and compressed by the file's zstd,

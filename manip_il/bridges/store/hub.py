@@ -1,6 +1,4 @@
-"""A repository on the Hugging Face Hub, or the server at HF_ENDPOINT, through huggingface_hub.
-
-Its card.
+"""Push to and pull from the Hugging Face Hub, or the server at HF_ENDPOINT, and write cards.
 
 Files keep their paths, so that LeRobot reads them. A push is one commit on top of the version that
 the folder was compared with; then the tag `v3.0`, by which LeRobot finds datasets, is moved to that

@@ -1,6 +1,6 @@
 """The files of one version of a dataset or run, with sizes and hashes.
 
-What arrives of them is counted.
+`Arrival` counts their bytes as they are downloaded.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Push a folder to a remote, checked and visible only when complete.
+"""Push a folder to a remote, and pull it back.
 
-Pull it back, verified, in one rename.
+A push is checked first and is visible only when complete; a pull is verified, and its folder
+appears in one rename.
 """
 
 import filecmp
