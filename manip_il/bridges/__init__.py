@@ -1,1 +1,1 @@
-"""What moves datasets and policies to and from other programs: stores, MCAP, checks and repairs."""
+"""Exchange datasets and policies with other programs: stores, MCAP, checks and repairs."""

@@ -66,10 +66,12 @@ class Output(Replacing):
     def open(self, *sources: Path, saved: Any = None) -> Generator[Path]:
         """Lock and prepare the folder, and write the options to `config.yaml`.
 
-        A resumed run must have the same ones.
+        A resumed run must have the same options. Raises what `prepare_output` and
+        `check_same_options` raise.
 
-        sources: further inputs, which must not be replaced. saved: options to write in place of the
-        command's. Raises what `prepare_output` and `check_same_options` raise.
+        Args:
+            sources: Further inputs, which must not be replaced.
+            saved: Options to write in place of the command's.
         """
         with self.lock(*sources, saved=saved) as prepare:
             prepare()
@@ -227,11 +229,15 @@ def publish(
     page: Report | None = None,
     options: Any = None,
 ) -> None:
-    """Write a result as JSON, and its report beside it if there is one.
+    """Write a result as JSON, with its report beside it, and print what was found.
 
-    Print its tables, lines and files.
-
-    options: as for `about`.
+    Args:
+        path: The JSON file.
+        content: The result, as plain JSON values.
+        tables: Tables to print.
+        lines: Lines to print below the tables; the names of the written files follow them.
+        page: The report, if there is one.
+        options: The command's options, for the report; see `about`.
     """
     written = [f"result: {path}"]
     write_json(path, content)

@@ -55,11 +55,16 @@ def given(
     fixed: Collection[str] = (),
     **own: Any,
 ) -> Any:
-    """Return a field that holds, as a dict (`Given`), those options of the dataclass `cls` that the
-    user gave.
+    """Return a field that holds those options of a dataclass that the user gave.
 
-    only: names of fields, by default all. fixed: those that may not grow when this command is
-    resumed. own: defaults that replace those of `cls`; the dict always holds them.
+    The field is a dict, `Given`.
+
+    Args:
+        cls: The dataclass with the options.
+        prefix: What the options' names begin with, by default the field's name and a dot.
+        only: Names of the options that the command has, by default all.
+        fixed: Names of the options that may not grow when the command is resumed.
+        own: Defaults that replace those of `cls`; the dict always holds them.
     """
     metadata = {"given": cls, "only": only, "fixed": fixed}
     names = {} if prefix is None else {"prefix": prefix}
@@ -68,14 +73,18 @@ def given(
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a command. default: `MISSING` if the user must give a value.
+    """One option of a command.
 
-    path: attributes and keys that lead from the command's options to its value. metadata: `help`,
-    one line; `positional` for a value without a name; `command_line_only` for an option that no
-    file may set; `exists` for a path that must exist, with its prefix on the Hub (`datasets/`);
-    `flag`, the full name; `at_least` and `at_most`; `free` and `grows` for an option that a resumed
-    run may change (see `check_same_options`). is_given: whether it is an option of another class,
-    see `given`.
+    Attributes:
+        name: The dotted name, such as `dataset.root`.
+        path: Attributes and keys that lead from the command's options to its value.
+        type: The type of its value.
+        default: Its default; `MISSING` if the user must give a value.
+        metadata: `help`, one line; `positional` for a value without a name; `command_line_only` for
+            an option that no file may set; `exists` for a path that must exist, with its prefix on
+            the Hub (`datasets/`); `flag`, the full name; `at_least` and `at_most`; `free` and
+            `grows` for an option that a resumed run may change (see `check_same_options`).
+        is_given: Whether it is an option of another class, see `given`.
     """
 
     name: str  # dotted: `dataset.root`
@@ -121,8 +130,13 @@ class Option:
 def options_of(
     cls: type, base: Any = None, prefix: str = "", path: tuple[str, ...] = ()
 ) -> list[Option]:
-    """Return all options of a dataclass, groups expanded, keyword-only ones last. base: instance
-    with the defaults.
+    """Return all options of a dataclass, with its groups expanded and keyword-only options last.
+
+    Args:
+        cls: The dataclass.
+        base: An instance whose values are the defaults; None for those of the class.
+        prefix: What the options' names begin with.
+        path: Attributes that lead from the command's options to this dataclass.
     """
     found: list[Option] = []
     for one in sorted(dataclasses.fields(cls), key=lambda one: one.kw_only is True):
@@ -292,9 +306,13 @@ class _Value(NamedTuple):
 def parse[T](cls: type[T], words: Sequence[str], command: str = "COMMAND") -> T:
     """Read options from the command line.
 
-    `UsageError` for an unknown name, or an invalid or missing value.
+    Args:
+        cls: The dataclass of the command's options.
+        words: The words after the command's name.
+        command: The command's name, for error messages.
 
-    command: the command's name, for error messages.
+    Raises:
+        UsageError: for an unknown name, or for an invalid or missing value.
     """
     known = {option.name: option for option in options_of(cls)}
     known[CONFIG_PATH] = Option(CONFIG_PATH, (), Path, None, {})
@@ -312,10 +330,16 @@ def from_yaml[T](path: Path, cls: type[T]) -> T:
 def from_layers[T](
     cls: type[T], layers: Sequence[tuple[str, Any]], words: Mapping[str, _Value] | None = None
 ) -> T:
-    """Read options from trees of YAML; later trees override earlier ones, and `words` override all.
+    """Read options from trees of YAML and from words.
 
-    layers: pairs (origin, tree); error messages name the origin. Raises `UsageError` as `parse`
-    does.
+    Args:
+        cls: The dataclass of the options.
+        layers: Pairs (origin, tree), of which later ones override earlier ones; error messages name
+            the origin.
+        words: Name -> value from the command line; they override all trees.
+
+    Raises:
+        UsageError: for an unknown name, or for an invalid or missing value.
     """
     known = {option.name: option for option in options_of(cls)}
     raw = dict[str, _Value]()

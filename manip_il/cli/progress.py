@@ -41,7 +41,13 @@ def say(*lines: str) -> None:
 
 
 def say_next(*words: object, what: str = "next", program: str = "manip-il") -> None:
-    """Print a command to copy, quoted for a shell. what: what it is for. program: whose command."""
+    """Print a command to copy, quoted for a shell.
+
+    Args:
+        words: The words after the program's name.
+        what: What the command is for.
+        program: The program's name.
+    """
     say(f"{what}: {shlex.join([program, *map(str, words)])}")
 
 
@@ -92,8 +98,9 @@ class Stages(Progress):
     progress is switched off. The first Ctrl-C or SIGTERM stops the work after the current step, the
     second at once.
 
-    kept: what is saved and can be resumed, for the message if the work is interrupted or fails.
-    prepare: prepares the output when the inputs have been checked.
+    Args:
+        kept: What is saved and can be resumed, for the message if the work is interrupted or fails.
+        prepare: Prepares the output when the inputs have been checked.
     """
 
     def __init__(self, kept: str = "", prepare: Callable[[], None] | None = None):
@@ -151,8 +158,11 @@ class Stages(Progress):
 
     @override
     def step(self, n: int = 1, **numbers: float) -> None:
-        """Count `n` steps. numbers: shown beside the bar (loss=0.12, success=0.9) until
-        replaced.
+        """Count some steps of the stage.
+
+        Args:
+            n: Number of steps.
+            numbers: Shown beside the bar, such as loss=0.12, until they are replaced.
         """
         if self._bar is not None:
             if numbers:

@@ -1,10 +1,9 @@
 """Write files and folders atomically, and name the path if a disk is full or read-only.
 
-Files with one JSON record per line; a kill truncates at most the last line.
+Some files have one JSON record per line; a kill truncates at most the last line.
 
-Whether this program made a folder, and of which kind it is: known by what it wrote into it.
-
-Everything that replaces, empties or adds to a folder asks here first.
+A folder's content tells whether this program made it, and of which kind it is. Everything that
+replaces, empties or adds to a folder checks this here first.
 """
 
 import contextlib
@@ -38,8 +37,10 @@ _OPTIONS = re.compile(rf"{CONFIG_HEADER} .*\((\w+)\)\n".encode())
 
 
 def output_of(options: str) -> str:
-    """Return the kind of the folder that holds a command's options. options: name of their
-    class.
+    """Return the kind of the folder that holds a command's options.
+
+    Args:
+        options: Name of the options' class.
     """
     command = options.removesuffix("Options").lower()
     return EPISODES if command == "record" else f"the output of manip-il {command}"
@@ -142,12 +143,16 @@ def new_folder(root: Path, *, replaces: str = "") -> Generator[Path]:
     At the end, sync it to disk and rename it to `root`.
 
     It is in `.NAME.partial`, which an exception removes, and which the next writer empties if a
-    killed process left it. Raises `ManipError` if the disk is full or read-only, or if another
-    process writes the same folder.
+    killed process left it.
 
     Args:
         root: The new folder. It must not exist or be empty, at the beginning and at the end.
         replaces: Kind of folder whose place it may take instead, as `kind_of` names it.
+
+    Raises:
+        FolderExistsError: if `root` is not empty and `replaces` is empty.
+        UsageError: if `root` is another kind of folder, or a link.
+        ManipError: if the disk is full or read-only, or if another process writes the same folder.
     """
     root = root.absolute()
     require_replaceable(root, replaces)

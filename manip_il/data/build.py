@@ -40,14 +40,19 @@ Rollouts = Iterable[tuple[Journal, Episode]]
 
 @dataclass(frozen=True)
 class Recording:
-    """Settings for making a dataset from rollouts, stored as `recording.json` in the folder of
-    their journals.
+    """Settings for making a dataset from rollouts.
 
-    A rollout becomes one episode per part (see `parts`). only_successes: leave out failed episodes.
-    only_labelled: leave out episodes without a valid label. episodes: number of episodes to keep,
-    in seed order; None: all. labels: number of valid labels to keep; later ones have `label_valid`
-    0, and later episodes are left out. provenance: who drove, stored in the dataset. video: fields
-    of `VideoConfig`.
+    They are stored as `recording.json` in the folder of the rollouts' journals. A rollout becomes
+    one episode per part (see `parts`).
+
+    Attributes:
+        only_successes: Whether failed episodes are left out.
+        episodes: Number of episodes to keep, in seed order; None for all.
+        provenance: Who drove; stored in the dataset.
+        video: Fields of `VideoConfig`.
+        only_labelled: Whether episodes without a valid label are left out.
+        labels: Number of valid labels to keep, None for all; later ones have `label_valid` 0, and
+            later episodes are left out.
     """
 
     only_successes: bool = False
@@ -157,12 +162,22 @@ def _first_labels(episode: Episode, most: float) -> Episode:
 
 
 def build(journals: Path, root: Path, *, replace: bool = False) -> tuple[Info, int]:
-    """Build a LeRobot dataset from a folder of journals, in seed order, equal to the dataset that
-    `record` writes.
+    """Build a LeRobot dataset from a folder of journals, equal to the one that `record` writes.
 
-    Returns and raises what `Recording.make` does. Also raises `ManipError` if journals are missing
-    or damaged. replace: replace an existing `root`; otherwise raises `FolderExistsError` if `root`
-    is not empty.
+    Args:
+        journals: The folder of journals, which are read in seed order.
+        root: The new folder.
+        replace: Whether to replace an existing dataset.
+
+    Returns:
+        The dataset's info and the number of failed episodes left out.
+
+    Raises:
+        FolderExistsError: if `root` is not empty and `replace` is false.
+        UsageError: if the folder to replace is not a dataset of this program.
+        MismatchError: if the journals differ in robot, task or cameras.
+        NothingToLearnError: if no episode has labels.
+        ManipError: if journals are missing or damaged, or the dataset cannot be written.
     """
     recording = Recording.read(journals)
     if not (paths := list_episodes(journals)):
@@ -232,9 +247,14 @@ def merge_datasets(
 
 
 def choose_episodes(words: Sequence[str], count: int) -> set[int]:
-    """Return the numbers of the chosen episodes among `count`. words: `7`, `0:50` (0 to 49), `50:`.
+    """Return the numbers of the chosen episodes.
 
-    none: all.
+    Args:
+        words: Numbers and ranges such as `7`, `0:50` (0 to 49) and `50:`; all if there are none.
+        count: Number of episodes to choose from.
+
+    Raises:
+        UsageError: if a word is neither a number nor a range in `0:count`.
     """
     chosen: set[int] = set()
     for word in words or [":"]:

@@ -46,8 +46,13 @@ _OPEN_FILMS, _OPEN_TABLES = 32, 4  # video and data files that one process keeps
 
 @dataclass(frozen=True)
 class FrameRange:
-    """Frames `first` to `first + count - 1` of a file: the dataset's rows `row` to `row + count
-    - 1`.
+    """Successive frames of a file, which belong to successive rows of the dataset.
+
+    Attributes:
+        path: The file.
+        first: Index of the first frame in the file.
+        count: Number of frames.
+        row: The dataset's row of the first frame.
     """
 
     path: Path
@@ -60,9 +65,12 @@ class FrameRange:
 class Camera:
     """Pictures of one camera.
 
-    key: its column. fps: [Hz]. size: height and width [pixels]. films: whether pictures are in
-    video files; otherwise they are cells of the data files. parts: ranges that hold every row once,
-    in order.
+    Attributes:
+        key: The camera's column.
+        fps: Rate of the pictures [Hz].
+        size: Height and width [pixels].
+        films: Whether pictures are in video files; otherwise they are cells of the data files.
+        parts: Ranges that hold every row once, in order.
     """
 
     key: str
@@ -111,12 +119,18 @@ class Camera:
 def decode(
     cameras: Sequence[Camera], on_frames: Callable[[int], None] | None = None
 ) -> NDArray[np.uint8]:
-    """Return all pictures of cameras, decoded with one thread per core, channels first: (N, 3,
-    height, width).
+    """Decode all pictures of some cameras, with one thread per core.
 
-    The array is a memory map of an unnamed temporary file, which is deleted with it. on_frames:
-    called with the number of frames decoded since the last call. Raises `ManipError` if the disk is
-    full.
+    Args:
+        cameras: The cameras, whose pictures all have the same size.
+        on_frames: Called with the number of frames decoded since the last call.
+
+    Returns:
+        The pictures, channels first, (N, 3, height, width): a memory map of an unnamed temporary
+        file, which is deleted with it.
+
+    Raises:
+        ManipError: if the disk is full.
     """
     shape = sum(camera.frames for camera in cameras), 3, *cameras[0].size
     with writing(Path(tempfile.gettempdir())), tempfile.TemporaryFile() as file:
@@ -203,9 +217,20 @@ def open_video(path: Path, size: tuple[int, int] | None = None) -> InputContaine
 
 
 def read_frames(container: InputContainer, first: int, count: int, fps: float) -> Pictures:
-    """Decode frames `first` to `first + count - 1` of an open video, (count, height, width, 3).
+    """Decode successive frames of an open video.
 
-    Raises `ValueError` if one is missing, and what the decoder raises.
+    Args:
+        container: The video.
+        first: Index of the first frame.
+        count: Number of frames.
+        fps: Rate of the video [frames/s].
+
+    Returns:
+        The pictures, (count, height, width, 3).
+
+    Raises:
+        ValueError: if a frame is missing.
+        av.FFmpegError: if the video cannot be decoded.
     """
     stream = container.streams.video[0]
     tick = stream.time_base or 1  # [s]

@@ -45,8 +45,12 @@ _NUMBERED = (layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
 
 @dataclass(frozen=True)
 class Own:
-    """Content of `meta/manip_il.json`: the spec, the environment's fingerprint, and the origin
-    of the episodes.
+    """Content of `meta/manip_il.json`.
+
+    Attributes:
+        spec: The environment's description.
+        fingerprint: The environment's fingerprint.
+        provenance: The origin of the episodes.
     """
 
     spec: s.EnvironmentSpec
@@ -231,11 +235,16 @@ class Dataset:
         return found
 
     def columns(self, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
-        """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors.
+        """Read whole columns in stored order.
 
-        They may be read-only.
+        Args:
+            names: The columns, by default all numeric ones.
 
-        names: by default all numeric columns. Raises `UnknownName` for an unknown column.
+        Returns:
+            Column -> values, (T,) for scalars, (T, d) for vectors; they may be read-only.
+
+        Raises:
+            UnknownName: for an unknown column.
         """
         if names is None:
             names = [feature.key for feature in self.info.of_dtype(*NUMBERS)]
@@ -330,8 +339,10 @@ class Dataset:
     ) -> Iterator[EpisodeData]:
         """Yield the episodes as they are stored, in order; one data file is in memory at a time.
 
-        names: columns to read, by default all in data files, except the numbers of rows, episodes
-        and tasks. renamed: new names of columns and cameras.
+        Args:
+            names: Columns to read, by default all in data files, except the numbers of rows,
+                episodes and tasks.
+            renamed: Column or camera -> its new name.
         """
         if names is None:
             names = [
@@ -400,9 +411,15 @@ _IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}
 class JoinedDatasets:
     """Several datasets; frames are numbered in the given order.
 
-    features: LeRobot's table of the columns and cameras that every dataset has, with equal shapes
-    and without depth. stats: over all frames. Cameras have ImageNet's mean and std, as in
-    `lerobot-train`; their other statistics are the first dataset's. tasks: each text once.
+    Args:
+        datasets: At least one dataset.
+
+    Attributes:
+        features: LeRobot's table of the columns and cameras that every dataset has, with equal
+            shapes and without depth.
+        stats: Statistics over all frames. Cameras have ImageNet's mean and std, as in
+            `lerobot-train`; their other statistics are the first dataset's.
+        tasks: Texts of the tasks, each text once.
     """
 
     table: dict[str, NDArray[Any]]  # numeric columns, once training has read them

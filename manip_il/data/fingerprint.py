@@ -16,7 +16,17 @@ _FOR_PEOPLE = ("README.md", "train_config.json")
 def compare_fingerprints(
     left_name: str, left: Mapping[str, Any], right_name: str, right: Mapping[str, Any]
 ) -> list[str]:
-    """Return one warning, naming both sides, for every entry that differs."""
+    """Compare the fingerprints of two environments.
+
+    Args:
+        left_name: Name of the first side, for the warnings.
+        left: Its fingerprint.
+        right_name: Name of the second side, for the warnings.
+        right: Its fingerprint.
+
+    Returns:
+        One warning, naming both sides, for every entry that differs or that only one side has.
+    """
     warnings: list[str] = []
     for key in dict.fromkeys([*left, *right]):
         ours, theirs = left.get(key, "nothing"), right.get(key, "nothing")

@@ -1,6 +1,6 @@
-"""Encode columns as messages that Foxglove shows without settings, one per frame and topic.
+"""Encode columns as messages that Foxglove shows without settings, and decode pictures.
 
-Decode pictures.
+There is one message per frame and topic.
 
 Schemas: Foxglove's own in protobuf (`JointStates`, `RawImage`, `Log`), LeRobot's scalars in JSON.
 Numbers and pictures keep every bit. Pictures are stored raw and compressed by the file's zstd,
@@ -56,7 +56,13 @@ def frame_times(count: int, rate: Fraction) -> list[int]:
 
 
 def joint_states(names: Sequence[str], values: NDArray[Any], times: Times) -> Messages:
-    """Yield one message per row of the positions (T, n) of named joints."""
+    """Yield one message of joint positions per frame.
+
+    Args:
+        names: Names of the n joints.
+        values: The positions, (T, n).
+        times: Times of the T frames [ns].
+    """
     for time, row in zip(times, values.tolist(), strict=True):
         joints = [
             JointState(name=name, position=position)
@@ -66,8 +72,11 @@ def joint_states(names: Sequence[str], values: NDArray[Any], times: Times) -> Me
 
 
 def scalars(labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Messages:
-    """Yield one JSON message of labelled numbers per row. rows: T rows of Python numbers, which
-    must be finite.
+    """Yield one JSON message of labelled numbers per row.
+
+    Args:
+        labels: Names of the numbers.
+        rows: T rows of Python numbers, which must be finite.
     """
     for row in rows:
         pairs = zip(labels, row, strict=True)
@@ -76,7 +85,13 @@ def scalars(labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Messages:
 
 
 def images(frame_id: str, pictures: Iterable[U8], times: Times) -> Messages:
-    """Yield one message per RGB picture (height, width, 3), uncompressed."""
+    """Yield one message per picture, uncompressed.
+
+    Args:
+        frame_id: Name of the camera.
+        pictures: T RGB pictures, each (height, width, 3).
+        times: Times of the T frames [ns].
+    """
     for time, picture in zip(times, pictures, strict=True):
         height, width, depth = picture.shape
         yield RawImage(
@@ -91,7 +106,13 @@ def images(frame_id: str, pictures: Iterable[U8], times: Times) -> Messages:
 
 
 def texts(name: str, lines: Iterable[str], times: Times) -> Messages:
-    """Yield one log message per line, with `name` as its source."""
+    """Yield one log message per line.
+
+    Args:
+        name: The source that the messages name.
+        lines: T lines.
+        times: Times of the T frames [ns].
+    """
     for time, line in zip(times, lines, strict=True):
         yield Log(timestamp=_stamp(time), level=Log.Level.INFO, name=name, message=line)
 
@@ -102,7 +123,16 @@ def _stamp(time: int) -> Timestamp:
 
 
 def episode_channels(episode: Episode, times: Times, joints: Sequence[str]) -> dict[str, Messages]:
-    """Return the messages of the episode's columns by topic. joints: the names of the joints."""
+    """Return the messages of an episode's columns.
+
+    Args:
+        episode: The episode, with T frames.
+        times: Times of the frames [ns].
+        joints: Names of the joints.
+
+    Returns:
+        Topic -> messages, one per frame.
+    """
     columns = episode.columns
     found = {
         topic: joint_states(joints, columns[key], times)
@@ -120,7 +150,16 @@ def episode_channels(episode: Episode, times: Times, joints: Sequence[str]) -> d
 
 
 def add_channels(writer: Writer, channels: Mapping[str, Messages], times: Times) -> None:
-    """Write all messages, frame by frame. channels: topic -> messages."""
+    """Write all messages to a file, frame by frame.
+
+    Args:
+        writer: The open file.
+        channels: Topic -> messages, one per frame.
+        times: Times of the frames [ns].
+
+    Raises:
+        ValueError: if the channels and `times` differ in length.
+    """
     schemas: dict[type, int] = {}  # class of messages -> its schema
     ids: dict[str, int] = {}
     for frame, (time, messages) in enumerate(

@@ -24,7 +24,14 @@ _MOST = 2**53  # highest accepted number of frames or episodes
 
 @dataclass(frozen=True)
 class Feature:
-    """One column or camera. shape: shape of one frame. table: its whole entry in `info.json`."""
+    """One column or camera.
+
+    Attributes:
+        key: Its name.
+        dtype: Its type as LeRobot names it, such as `float32` or `video`.
+        shape: Shape of one frame.
+        table: Its whole entry in `info.json`.
+    """
 
     key: str
     dtype: str
@@ -88,7 +95,16 @@ class Feature:
 
 @dataclass(frozen=True)
 class Info:
-    """Content of `meta/info.json`. fps: [Hz]. episodes, frames, tasks: how many there are."""
+    """Content of `meta/info.json`.
+
+    Attributes:
+        fps: Rate of the frames [Hz].
+        features: Name of a column or camera -> its description.
+        episodes: Number of episodes.
+        frames: Number of frames.
+        tasks: Number of tasks, if known.
+        robot: LeRobot's `robot_type`.
+    """
 
     fps: float
     features: dict[str, Feature]

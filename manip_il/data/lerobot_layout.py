@@ -50,12 +50,15 @@ STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
 def data_schema(features: Features, columns: Mapping[str, Any]) -> pa.Schema:
-    """Return the Arrow schema of the data files: shape (1,) becomes a plain value, a vector a list
-    of fixed size.
+    """Return the Arrow schema of the data files.
 
-    Its metadata describes the columns in the form that Hugging Face's package `datasets` reads.
-    columns: those of an episode; types that are not LeRobot's for numbers, text or pictures, such
-    as language, are kept.
+    Shape (1,) becomes a plain value, a vector a list of fixed size. The schema's metadata describes
+    the columns in the form that Hugging Face's package `datasets` reads.
+
+    Args:
+        features: The columns and cameras.
+        columns: The columns of an episode; types that are not LeRobot's for numbers, text or
+            pictures, such as language, are kept.
     """
     types: dict[str, pa.DataType] = {}
     hugging_face: dict[str, Any] = {}
@@ -93,8 +96,12 @@ def tasks_table(instructions: Sequence[str]) -> pa.Table:
 
 
 def numbered(template: str, number: int, **names: str) -> tuple[str, int, int]:
-    """Return path, chunk index and file index of file `number`. names: values of the template's
-    other fields.
+    """Return the path, the chunk index and the file index of a numbered file.
+
+    Args:
+        template: The path, with the fields `chunk_index` and `file_index`.
+        number: The file's number, from 0.
+        names: Values of the template's other fields.
     """
     chunk, file = divmod(number, CHUNKS_SIZE)
     return template.format(chunk_index=chunk, file_index=file, **names), chunk, file

@@ -38,9 +38,13 @@ _EPISODE_COLUMNS = re.compile(
 class ParquetFiles:
     """Writes numbered parquet files, one at a time: when a file is full, the next one is started.
 
-    group_rows: least number of rows in a row group; a file's last one may have fewer. A writer
-    keeps a description of every row group in memory until the file is closed, so many small groups
-    would need more memory than the rows.
+    A writer keeps a description of every row group in memory until the file is closed, so many
+    small groups would need more memory than the rows.
+
+    Args:
+        folder: Folder of the dataset.
+        template: The files' path in it, with the fields `chunk_index` and `file_index`.
+        group_rows: Least number of rows in a row group; a file's last one may have fewer.
     """
 
     def __init__(self, folder: Path, template: str, group_rows: int = 1):
@@ -216,9 +220,16 @@ class VideoSpans:
 
 @dataclass(frozen=True)
 class EpisodeTable:
-    """Columns with one entry per episode. start, stop: rows, stop excluded.
+    """Columns with one entry per episode.
 
-    others: values in the columns that LeRobot does not have.
+    Attributes:
+        index: Indices of the episodes.
+        length: Numbers of frames.
+        start: First rows.
+        stop: Last rows plus one.
+        tasks: Texts of the tasks.
+        clips: Column of a camera -> where its episodes are.
+        others: Values in the columns that LeRobot does not have.
     """
 
     index: I64

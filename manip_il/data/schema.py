@@ -89,10 +89,19 @@ def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:
 def check_same_spec(
     left_name: str, left: Any, right_name: str, right: EnvironmentSpec, also: Sequence[str] = ()
 ) -> None:
-    """Raise `MismatchError` unless actions and observations have the same meaning on both sides.
+    """Check that actions and observations have the same meaning on both sides.
 
-    The task may differ, so that a policy can be tried on another task. left: a spec, or an object
-    with the same fields. also: other fields that must agree.
+    The task may differ, so that a policy can be tried on another task.
+
+    Args:
+        left_name: Name of the first side, for the message.
+        left: Its spec, or an object with the same fields.
+        right_name: Name of the second side, for the message.
+        right: Its spec.
+        also: Further fields that must agree.
+
+    Raises:
+        MismatchError: for the first field that differs.
     """
     for what in (*MUST_AGREE, *also):
         ours, theirs = getattr(left, what), getattr(right, what)

@@ -35,7 +35,14 @@ class CameraFiles:
 
     The same episodes give the same bytes.
 
-    size: height and width of the written pictures [pixels]; None if films were only copied.
+    Args:
+        folder: Folder of the dataset.
+        key: The camera's key in the dataset, such as `observation.images.front`.
+        config: Settings of the encoder.
+        fps: Rate of the videos [frames/s].
+
+    Attributes:
+        size: Height and width of the written pictures [pixels]; None if videos were only copied.
     """
 
     def __init__(self, folder: Path, key: str, config: VideoConfig, fps: float):
@@ -104,8 +111,10 @@ class CameraFiles:
             container.close()
 
     def info(self, size: tuple[int, int]) -> dict[str, Any]:
-        """Return the entry of LeRobot's `info.json` for this camera. size: height and width
-        [pixels].
+        """Return the entry of LeRobot's `info.json` for this camera.
+
+        Args:
+            size: Height and width of the pictures [pixels].
         """
         config = self._config
         return {
@@ -217,7 +226,16 @@ def _video_frame(picture: NDArray[np.uint8], number: int, rate: Fraction) -> av.
 
 
 def try_encoder(config: VideoConfig, size: tuple[int, int], fps: float) -> None:
-    """Encode one picture of this height and width; raises `UsageError` if that fails."""
+    """Encode one black picture, to find out whether the encoder accepts its settings.
+
+    Args:
+        config: Settings of the encoder.
+        size: Height and width of the picture [pixels].
+        fps: Rate of the video [frames/s].
+
+    Raises:
+        UsageError: if the picture cannot be encoded.
+    """
     rate = exact_rate(fps)
     try:
         encoder = av.CodecContext.create(config.vcodec, "w")

@@ -38,10 +38,14 @@ Group = Literal["start", "state", "action"]
 
 
 class Case(NamedTuple):
-    """One episode. moment: the control step from which the expert is judged.
+    """One episode of a certificate.
 
-    steps: control steps from the moment until the task is solved; None if not solved within the
-    horizon. undisturbed: the same without the perturbation, if known.
+    Attributes:
+        seed: The episode's seed.
+        moment: The control step from which the expert is judged.
+        steps: Control steps from the moment until the task is solved; None if it is not solved
+            within the horizon.
+        undisturbed: The same without the perturbation, if known.
     """
 
     seed: int
@@ -52,10 +56,16 @@ class Case(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """The cases of one kind. kind, words: its short and full name; horizon: [control steps].
+    """The cases of one kind of perturbation.
 
-    left_out: number of episodes without a case, because the undisturbed run failed, or the
-    perturbation could not be placed or changed nothing.
+    Attributes:
+        group: What is perturbed.
+        kind: Short name of the kind.
+        words: Full name of the kind.
+        cases: The cases, by seed.
+        horizon: Control steps within which the expert must solve the task.
+        left_out: Number of episodes without a case, because the undisturbed run failed, or the
+            perturbation could not be placed or changed nothing.
     """
 
     group: Group
@@ -96,10 +106,15 @@ class Row:
 
 @dataclass(frozen=True)
 class Certificate:
-    """Recoverability of the expert on one robot and task, one row per kind of perturbation.
+    """Recoverability of the expert on one robot and task.
 
-    settings: cases (per kind), seed, horizon [control steps], control_hz, tolerance [m] and
-    success_steps.
+    Attributes:
+        robot: Name of the robot.
+        task: Name of the task.
+        fingerprint: The environment's fingerprint.
+        settings: `cases` (per kind), `seed`, `horizon` [control steps], `control_hz`, `tolerance`
+            [m] and `success_steps`.
+        rows: One row per kind of perturbation.
     """
 
     robot: str
@@ -155,12 +170,24 @@ def certify(
     seed: int = 0,
     on_episode: Callable[[Episode], object] = lambda _: None,
 ) -> Certificate:
-    """Measure the expert on `env` with `cases` episodes per kind of perturbation, on seeds of the
-    stream `certificate`.
+    """Measure how well the expert recovers from perturbations in one environment.
 
     The step of a perturbation is drawn uniformly from those that the undisturbed run takes until
-    the task is solved; from that step on, the expert has a whole horizon to solve it. on_episode:
-    called with every episode as it ends.
+    the task is solved; from that step on, the expert has a whole horizon to solve it.
+
+    Args:
+        engine: What runs the episodes.
+        env: The environment.
+        cases: Number of episodes per kind of perturbation.
+        seed: Selects the episodes' seeds, which are from the stream `certificate`.
+        on_episode: Called with every episode as it ends.
+
+    Returns:
+        The certificate, with one row per kind of perturbation, one for undisturbed episodes and one
+        for noise on every action.
+
+    Raises:
+        ManipError: if the expert solves none of the undisturbed episodes.
     """
     seeds = stream_seeds("certificate", cases, seed)
     rows: list[Row] = []
@@ -203,7 +230,16 @@ def certify(
 
 
 def draw_moment(seed: int, kind: str, steps: int) -> int:
-    """Draw one of the `steps` steps of an undisturbed run, for one kind of perturbation."""
+    """Draw the control step at which an undisturbed run is perturbed, uniformly.
+
+    Args:
+        seed: The episode's seed.
+        kind: The kind of perturbation; each kind has its own random stream.
+        steps: Control steps until the undisturbed run solves the task.
+
+    Returns:
+        The index of the step, from 0 to `steps` - 1.
+    """
     return int(rng_for(seed, f"moment of {kind}").integers(steps))
 
 

@@ -28,12 +28,17 @@ FILE_NAME = "compare.json"
 
 @dataclass(frozen=True)
 class Comparison:
-    """`right` against `left`, paired by training seed and by test episode.
+    """Two sides, paired by training seed and by test episode.
 
-    Differences are right minus left.
+    Differences are right minus left. Episodes that only one side ran do not count.
 
-    Episodes that only one side ran do not count. Raises `MismatchError` if robot, task or settings
-    differ, `ManipError` if left and right share no episode.
+    Attributes:
+        left: The side that is compared with.
+        right: The other side.
+
+    Raises:
+        MismatchError: if robot, task or settings differ.
+        ManipError: if left and right share no episode.
     """
 
     left: Side
@@ -139,11 +144,16 @@ class Comparison:
 class Study:
     """Tested sides with the same training seeds, and what they cost.
 
-    baseline: the side that the others are compared with; None for sides of different tasks. rule:
-    how each run's round was chosen. target: validation success for which the cost is reported.
+    Attributes:
+        sides: The sides.
+        baseline: Name of the side that the others are compared with; None for sides of different
+            tasks.
+        rule: How each run's round was chosen.
+        target: Validation success for which the cost is reported, in [0, 1].
 
-    Raises what `Comparison` raises, and `ManipError` unless all sides of a comparison ran the same
-    episodes.
+    Raises:
+        MismatchError: if robot, task or settings of two compared sides differ.
+        ManipError: unless all sides of a comparison ran the same episodes.
     """
 
     sides: tuple[Side, ...]

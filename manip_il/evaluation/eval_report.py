@@ -18,7 +18,13 @@ from manip_il.worlds.table import world_of
 
 
 def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = "") -> Report:
-    """Return the report of an evaluation. no_films: why there are no films, or empty."""
+    """Return the report of an evaluation.
+
+    Args:
+        result: The evaluation.
+        films: The films to show.
+        no_films: Why there are no films; empty if there are films, or none were asked for.
+    """
     settings, success = result.settings, result.success
     solved = world_of(result.robot).success(settings.tolerance, settings.success_steps)
     end = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"

@@ -38,9 +38,12 @@ _STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture in a report. svg: the file's content; words: alternative text.
+    """A picture in a report.
 
-    width: natural width [px].
+    Attributes:
+        svg: Content of the SVG file.
+        words: Alternative text.
+        width: Natural width [px].
     """
 
     svg: bytes
@@ -52,9 +55,16 @@ class Figure:
 def drawing(
     columns: int, rows: int = 1, *, size: tuple[float, float], **options: Any
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield a figure and its axes (rows, columns) in the reports' style.
+    """Yield a figure and its axes in the reports' style.
 
-    size: size of one panel [inches]. options: of matplotlib's `Figure.subplots`.
+    Args:
+        columns: Number of panels side by side.
+        rows: Number of panels above each other.
+        size: Width and height of one panel [inches].
+        options: Further arguments of matplotlib's `Figure.subplots`.
+
+    Yields:
+        The figure, and its axes as an array (rows, columns).
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure as Drawn
@@ -74,7 +84,9 @@ def to_figure(drawn: Any, words: str) -> Figure:
 def curve_figures(sides: Sequence[Side], target: float | None = None) -> tuple[Figure, ...]:
     """Draw the validation success of each run of the sides against every cost, one figure each.
 
-    target: drawn as a horizontal line, in [0, 1].
+    Args:
+        sides: The sides.
+        target: Success that is drawn as a horizontal line, in [0, 1].
     """
     figures: list[Figure] = []
     for cost in costs_of(run for side in sides for run in side.histories):

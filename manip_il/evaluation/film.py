@@ -36,7 +36,18 @@ def run_states(job: RolloutJob, seed: int) -> Episode:
 
 
 def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str = "") -> Film:
-    """Return a film of an episode. Raises `RenderError` without off-screen OpenGL."""
+    """Return a film of an episode, with every `FILM_EVERY`-th control step as a frame.
+
+    Args:
+        env: The environment of the episode.
+        episode: The episode, with its states.
+        title: The film's title in the report.
+        caption: The text below the film.
+
+    Raises:
+        RenderError: if there is no off-screen OpenGL.
+        Unable: if the environment cannot be drawn.
+    """
     states = episode.columns[schema.SIM_STATE][::FILM_EVERY]
     spec = env_spec(env)
     spec.require("drawn", "there is no film of it")
@@ -67,9 +78,17 @@ def collect_films(made: Iterable[Film], progress: Progress) -> tuple[list[Film],
 def film_outcomes(
     engine: Engine, job: RolloutJob, result: EvalResult, most: int, progress: Progress
 ) -> tuple[list[Film], str]:
-    """Rerun and film up to `most` failed and up to `most` successful episodes of an evaluation.
+    """Rerun and film some failed and some successful episodes of an evaluation.
 
-    most: 0 for no films. Returns what `collect_films` does.
+    Args:
+        engine: What runs the episodes.
+        job: The rollouts of the evaluation.
+        result: The evaluation.
+        most: Largest number of failures to film, and of successes; 0 for no films.
+        progress: Follows the filming.
+
+    Returns:
+        What `collect_films` returns.
     """
     shown = [
         one
@@ -95,7 +114,9 @@ def film_outcomes(
 def encode_mp4(frames: Sequence[NDArray[np.uint8]], fps: float) -> bytes:
     """Return an MP4 that browsers play: H.264, 4:2:0.
 
-    frames: at least one, uint8 (height, width, 3); height and width must be even for 4:2:0.
+    Args:
+        frames: At least one RGB picture, uint8 (height, width, 3); height and width must be even.
+        fps: Rate of the video [frames/s].
     """
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as container:

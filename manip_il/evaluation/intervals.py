@@ -21,10 +21,13 @@ _EDGE = 1e-12  # smallest distance from 0 and 1 at which a rate's likelihood is 
 
 @dataclass(frozen=True, slots=True)
 class Proportion:
-    """`successes` of `n` trials with Wilson's interval; prints as `98.7 % [97.8, 99.3]`.
+    """A number of successes with Wilson's interval; prints as `98.7 % [97.8, 99.3]`.
 
-    sequential: whether `n` depended on the outcomes so far, so that the interval is that of a
-    confidence sequence.
+    Attributes:
+        successes: Number of successful trials.
+        n: Number of trials.
+        sequential: Whether `n` depended on the outcomes so far, so that the interval is that of a
+            confidence sequence.
     """
 
     successes: int
@@ -122,7 +125,14 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class PairCounts:
-    """Numbers of episodes solved by both, one or neither of two policies, left and right."""
+    """Outcomes of two policies, left and right, on the same episodes.
+
+    Attributes:
+        both: Number of episodes that both solved.
+        only_left: Number that only the left one solved.
+        only_right: Number that only the right one solved.
+        neither: Number that neither solved.
+    """
 
     both: int
     only_left: int
@@ -175,10 +185,12 @@ def sign_flip_exact(differences: Sequence[int]) -> float:
     """Return the two-sided p of the hypothesis that both signs of each test episode's difference
     are equally likely.
 
-    differences: right's successes minus left's in an episode, summed over training seeds. Since the
-    sign of this sum is flipped, outcomes of different training seeds in one episode need not be
-    independent. With one training seed this is McNemar's exact test; in general it is Fisher's
-    randomisation test (The Design of Experiments, 1935, section 21).
+    With one training seed this is McNemar's exact test; in general it is Fisher's randomisation
+    test (The Design of Experiments, 1935, section 21). Since the sign of an episode's sum is
+    flipped, outcomes of different training seeds in one episode need not be independent.
+
+    Args:
+        differences: Right's successes minus left's in an episode, summed over training seeds.
     """
     # counts of the sums -total, -total + 2, ..., total of signed differences
     ways = np.array([1], dtype=object)

@@ -181,9 +181,24 @@ def measure_sides(
 def open_driver(
     policy: Any, env: Env | None, kind: str = "expert", *, trust: bool = False, device: str = "cpu"
 ) -> tuple[EnvConfig, Driver, CameraConfig | None]:
-    """Return the environment, the checked driver and the cameras whose pictures the driver takes.
+    """Open what drives an evaluation, and check that it can drive the environment.
 
-    The arguments are those of `evaluate`. Raises what `check_policy` raises.
+    Args:
+        policy: A `Checkpoint`, or the path of a checkpoint or a run; None for no policy.
+        env: The environment, its name, or those of its settings that differ from the policy's
+            training environment.
+        kind: Who drives without a policy: expert or random.
+        trust: Whether to load models and code that the checkpoint names.
+        device: Where the policy computes, such as `cpu` or `cuda`.
+
+    Returns:
+        The environment, the driver, and the cameras whose pictures the driver takes, None if it
+        takes none.
+
+    Raises:
+        UsageError: if `env` is missing and the policy does not name one.
+        MismatchError: if the policy cannot drive the environment.
+        ManipError: if loading the policy needs `trust`.
     """
     checkpoint = None
     if policy is not None:
@@ -206,7 +221,14 @@ def open_driver(
 
 @dataclass(frozen=True)
 class Replay:
-    """An episode of an evaluation that was run again. differences: between both runs, in words."""
+    """An episode of an evaluation that was run again.
+
+    Attributes:
+        before: The episode's result in the evaluation.
+        job: What was run again.
+        episode: The episode of this run.
+        differences: Differences between both runs, in words; empty if there are none.
+    """
 
     before: EpisodeResult
     job: RolloutJob

@@ -20,7 +20,13 @@ REPORT_FILE = "report.html"
 
 @dataclass(frozen=True)
 class Film:
-    """One episode as an MP4 (H.264). title: in bold before the caption."""
+    """One episode as a film.
+
+    Attributes:
+        title: Shown in bold before the caption.
+        mp4: Content of the MP4 file (H.264).
+        caption: Text below the film.
+    """
 
     title: str
     mp4: bytes
@@ -29,9 +35,16 @@ class Film:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report.
+    """A part of a report; what is empty is omitted.
 
-    Empty parts are omitted. formulas: one per line; notes: paragraphs below the tables.
+    Attributes:
+        heading: Its title.
+        lead: Paragraphs below the title.
+        formulas: One formula per line.
+        figures: The figures.
+        tables: The tables.
+        notes: Paragraphs below the tables.
+        films: The films.
     """
 
     heading: str
@@ -45,11 +58,16 @@ class Section:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """A page: the verdict (a first sentence with numbers), further facts, sections, and how it was
-    made.
+    """A page of results, with how they were made.
 
-    command, config: the command that made it, and its options, which it fills in. fingerprint: a
-    nested mapping.
+    Attributes:
+        title: The page's title.
+        verdict: The first sentence, with numbers.
+        sections: The parts of the page.
+        facts: Further facts, one sentence each.
+        command: The command line that made the page, which the command fills in.
+        config: The command's options, which the command fills in.
+        fingerprint: The environment's fingerprint, a nested mapping.
     """
 
     title: str

@@ -37,11 +37,16 @@ _KEYS = {
 
 @dataclass(frozen=True, slots=True)
 class EpisodeResult:
-    """One episode: `success` at some time, `success_at_end` at the last frame, `ret` the sum of
-    rewards.
+    """The outcome of one episode.
 
-    steps: control steps until the episode ended. phase_at_end: the expert's name for the phase of
-    the last state. detail: further keys of the JSON object.
+    Attributes:
+        seed: The episode's seed.
+        success: Whether the task was solved at some time.
+        success_at_end: Whether it was solved at the last frame.
+        steps: Control steps until the episode ended.
+        ret: Sum of the rewards.
+        phase_at_end: The expert's name for the phase of the last state.
+        detail: Further keys of the JSON object.
     """
 
     seed: int
@@ -84,10 +89,16 @@ class EpisodeResult:
 class EvalSettings:
     """The settings that two evaluations must share to be comparable, and that reproduce an episode.
 
-    horizon, success_steps: control steps. tolerance: distance to the goal that counts as success
-    [m]. suite: the name of the conditions, which episodes cycle through. hold: control steps after
-    success at which an episode ends, None if it continues to the horizon. object: shape and size of
-    the object to grasp, empty for the task's default.
+    Attributes:
+        horizon: Largest number of control steps of an episode.
+        tolerance: Distance to the goal that counts as success [m].
+        control_hz: Control steps per second [Hz].
+        success_steps: Consecutive control steps within the tolerance that count as success.
+        suite: Name of the conditions.
+        conditions: The conditions, which episodes cycle through.
+        hold: Control steps after success at which an episode ends; None if it continues to the
+            horizon.
+        object: Shape and size of the object to grasp; empty for the task's default.
     """
 
     horizon: int
@@ -143,11 +154,19 @@ _SETTINGS = tuple(field.name for field in fields(EvalSettings))
 class EvalResult:
     """One policy on one robot and task: every episode, and the statistics derived from them.
 
-    policy_sha256: hash of the policy's files, if any. until_width: the interval width at which the
-    evaluation was to stop (intervals are then valid at any stopping time); None if the number of
-    episodes was fixed in advance.
+    Attributes:
+        policy: Name of the policy.
+        robot: Name of the robot.
+        task: Name of the task.
+        fingerprint: The environment's fingerprint.
+        episodes: The episodes' results.
+        settings: The settings that all episodes share.
+        policy_sha256: Hash of the policy's files; empty if there are none.
+        until_width: The interval width at which the evaluation was to stop (intervals are then
+            valid at any stopping time); None if the number of episodes was fixed in advance.
 
-    Raises `ManipError` on construction if there is no episode or a seed occurs twice.
+    Raises:
+        ManipError: if there is no episode, or a seed occurs twice.
     """
 
     policy: str
@@ -177,7 +196,16 @@ class EvalResult:
     ) -> EnvConfig:
         """Return the environment of the evaluation.
 
-        robot, task, shape: the user's own files, because results hold only the names of these.
+        The user's own files must be given again, because results hold only their names.
+
+        Args:
+            robot: The user's own robot, if any.
+            task: The user's own task, if any.
+            shape: The user's own mesh of the object, if any.
+
+        Raises:
+            UnknownName: if the robot or the task is not built in and its file is not given.
+            UsageError: if a setting is invalid.
         """
         of, limits = (
             self.settings,
@@ -335,8 +363,17 @@ def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
 
 
 def require_equal(left: str, one: object, right: str, other: object, *names: str) -> None:
-    """Raise `MismatchError` for the first attribute in which two objects differ. left, right:
-    names of the objects.
+    """Check that some attributes of two objects are equal.
+
+    Args:
+        left: Name of the first object, for the message.
+        one: The first object.
+        right: Name of the second object, for the message.
+        other: The second object.
+        names: The attributes to compare, in this order.
+
+    Raises:
+        MismatchError: for the first attribute that differs.
     """
     for name in names:
         ours, theirs = getattr(one, name), getattr(other, name)
@@ -347,8 +384,17 @@ def require_equal(left: str, one: object, right: str, other: object, *names: str
 def require_comparable(
     left: str, one: EvalResult, right: str, other: EvalResult, *more: str
 ) -> None:
-    """Raise `MismatchError` if two evaluations differ in robot, task, a setting, or an attribute
-    named in `more`.
+    """Check that two evaluations agree in robot, task and settings.
+
+    Args:
+        left: Name of the first evaluation, for the message.
+        one: The first evaluation.
+        right: Name of the second evaluation, for the message.
+        other: The second evaluation.
+        more: Further attributes that must agree; they are compared first.
+
+    Raises:
+        MismatchError: for the first difference.
     """
     require_equal(left, one, right, other, *more, "robot", "task")
     require_equal(left, one.settings, right, other.settings, *_SETTINGS)

@@ -43,11 +43,14 @@ _VIEW = (4.4, 3.5)  # size of a picture of the arm [inches]
 
 @dataclass(frozen=True)
 class TaskCheck:
-    """Result of one task with a robot.
+    """The result of one task with a robot.
 
-    starts: number of starts drawn before the first failure. refused: why that start failed, or why
-    there is no scene. clean, noisy: evaluations of the expert without and with a tenth of its
-    actions random; None if not run.
+    Attributes:
+        name: Name of the task.
+        starts: Number of starts drawn before the first failure.
+        refused: Why that start failed, or why there is no scene; empty if every start succeeded.
+        clean: Evaluation of the expert; None if not run.
+        noisy: Evaluation of the expert with a tenth of its actions random; None if not run.
     """
 
     name: str
@@ -75,10 +78,14 @@ class TaskCheck:
 
 @dataclass(frozen=True)
 class RobotCheck:
-    """Measurements of a robot. name: as given by the user.
+    """Measurements of a robot.
 
-    opening: largest opening of the gripper [m]. table: share of the workspace on the table that the
-    hand reaches while it points down.
+    Attributes:
+        name: The robot as given by the user.
+        robot: The robot's description.
+        opening: Largest opening of the gripper [m].
+        table: Share of the workspace on the table that the hand reaches while it points down.
+        tasks: The results of the tasks.
     """
 
     name: NameOrPath

@@ -19,10 +19,18 @@ METRICS_FILE = "metrics.jsonl"
 
 @dataclass(frozen=True)
 class Round:
-    """One round of DAgger, or one validated iteration of reinforcement learning, and the run's
-    costs up to its end.
+    """One round of DAgger, or one validated iteration of reinforcement learning.
 
-    steps: simulated control steps. seconds: for collecting and fitting, without validation.
+    The costs are those of the run up to the end of the round.
+
+    Attributes:
+        round: Number of the round or iteration.
+        labels: Number of expert labels.
+        episodes: Number of collected episodes.
+        steps: Number of simulated control steps.
+        seconds: Time for collecting and fitting, without validation [s].
+        validation: Success on the validation episodes.
+        unit: Whether this is a round or an iteration.
     """
 
     round: int
@@ -113,9 +121,12 @@ def costs_of(histories: Iterable[History]) -> list[Cost]:
 class Rule:
     """The rule that chooses the round of each run, fixed before any test episode.
 
-    checkpoint: the last round, or the one with the highest validation success (the later one if
-    equal). at: `end` allows all rounds; a cost, such as `labels`, allows rounds that used at most
-    `limit` of it. limit: the largest amount of this cost that every run reached.
+    Attributes:
+        checkpoint: The last round, or the one with the highest validation success (the later one
+            if equal).
+        at: `end` allows all rounds; a cost, such as `labels`, allows rounds that used at most
+            `limit` of it.
+        limit: The largest amount of this cost that every run reached.
     """
 
     checkpoint: Literal["best", "last"] = "best"

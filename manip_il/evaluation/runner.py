@@ -142,11 +142,25 @@ def measure(
     suite: str = NOMINAL.name,
     until_width: float | None = None,
 ) -> EvalResult:
-    """Return a job's evaluation in `folder`, after running the missing episodes.
+    """Evaluate a job in a folder, running only the episodes that are missing.
 
-    Each is saved as it ends.
+    Each episode is saved as it ends, so that an interrupted evaluation can be continued.
 
-    Raises what `finished_episodes` raises.
+    Args:
+        engine: What runs the episodes.
+        job: The rollouts.
+        seeds: The episodes' seeds.
+        name: The policy's name.
+        folder: Where the finished episodes and the result are stored.
+        progress: Follows the episodes.
+        suite: Name of the job's conditions.
+        until_width: Stop once the width of the interval is at most this; see `evaluate`.
+
+    Returns:
+        The evaluation, which is also written to `folder`.
+
+    Raises:
+        MismatchError: if `folder` holds episodes of another job.
     """
     done = finished_episodes(folder, job, suite)
 
@@ -165,12 +179,21 @@ def measure(
 
 
 def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, EpisodeResult]:
-    """Return seed -> result of the episodes in `folder`.
+    """Return the finished episodes of an evaluation's folder.
 
-    If the episodes' file is missing, write its first line.
+    The first line of the episodes' file identifies policy, environment, versions and settings. If
+    the file is missing or empty, that line is written.
 
-    The first line identifies policy, environment, versions and settings. Raises `MismatchError` if
-    they differ from those of `job`.
+    Args:
+        folder: The folder of the evaluation.
+        job: The rollouts that the episodes must be from.
+        suite: Name of the job's conditions.
+
+    Returns:
+        Seed -> result.
+
+    Raises:
+        MismatchError: if the first line differs from that of `job`.
     """
     path = folder / EPISODES_FILE
     common: dict[str, Any] = {

@@ -24,11 +24,17 @@ _SEED_FOLDER = re.compile(r"seed_(\d+)")
 
 @dataclass(frozen=True)
 class Member:
-    """One policy of a side: an evaluation, a checkpoint, or a run from which a rule chooses a
-    round.
+    """One policy of a side: an evaluation, a checkpoint, or a run of which a rule chooses a round.
 
-    policy: its folder; None for an evaluation, and for a run before its round is chosen. result:
-    None until measured.
+    Attributes:
+        path: The evaluation, checkpoint or run.
+        training_seed: The seed that the policy was trained with, if known.
+        history: The rounds of a run; empty for an evaluation and for a checkpoint.
+        policy: Folder of the policy; None for an evaluation, and for a run before its round is
+            chosen.
+        chosen: The round that was chosen; None for an evaluation, for a checkpoint, and for a run
+            before its round is chosen.
+        result: The evaluation; None until measured.
     """
 
     path: Path
@@ -87,8 +93,12 @@ class Member:
 class Side:
     """One policy, or one per training seed, as reports and comparisons show it.
 
-    labels: number of expert labels that a policy learnt from, if known. disturbed: its evaluation
-    under a disturbance, if any.
+    Attributes:
+        name: Name of the side.
+        members: The policies, one per training seed.
+        colour: Colour in reports, such as `#0072b2`.
+        labels: Number of expert labels that a policy learnt from, if known.
+        disturbed: The policy's evaluation under a disturbance, if any.
     """
 
     name: str
@@ -99,7 +109,13 @@ class Side:
 
     @classmethod
     def of(cls, name: str, result: EvalResult, **more: Any) -> Side:
-        """Return the side of one evaluation. more: other fields."""
+        """Return the side of one evaluation.
+
+        Args:
+            name: Name of the side.
+            result: The evaluation.
+            more: Other fields.
+        """
         return cls(name, (Member(Path(name), result=result),), **more)
 
     @property
@@ -181,9 +197,11 @@ def require_pair(left: Side, right: Side) -> None:
 def require_same_env(envs: Mapping[str, EnvConfig]) -> EnvConfig:
     """Return the environment that all sides or runs share.
 
-    Raises `MismatchError` for the first difference.
+    Args:
+        envs: Name of a side or run -> its environment.
 
-    envs: name of a side or run -> its environment.
+    Raises:
+        MismatchError: for the first difference.
     """
     (first, env), *others = envs.items()
     for name, other in others:

@@ -23,9 +23,17 @@ _OWN = Path(__file__).with_name("conditions")  # the YAML files of `CONDITIONS`
 def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
     """Return the conditions of a suite, in the order in which seeds cycle through them.
 
-    Omits conditions without effect: those on objects if the task has none, those on cameras if the
-    policy uses none (`sees`). Limits the objects' sizes to those that the task allows. Raises
-    `UnknownName` for an unknown suite, `UsageError` for an invalid file or if no condition is left.
+    Conditions without effect are omitted: those on objects if the task has none, and those on
+    cameras if the policy uses none. Objects' sizes are limited to those that the task allows.
+
+    Args:
+        suite: A name in `SUITES` or `CONDITIONS`, or the path of a YAML file of ranges.
+        env: The environment of the evaluation.
+        sees: Whether the policy uses cameras.
+
+    Raises:
+        UnknownName: for an unknown suite.
+        UsageError: if the file is invalid, or if no condition is left.
     """
     asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
     world = world_of(env.robot)
@@ -40,12 +48,19 @@ def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Conditi
 
 
 def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
-    """Return the conditions in `--vary` merged into one, from which every episode samples.
+    """Merge the conditions in `--vary` into one, from which every episode samples.
 
-    () if there are no names.
+    Args:
+        names: Names in `CONDITIONS` other than nominal, or paths of YAML files of ranges.
+        env: The environment.
+        sees: Whether cameras are used.
 
-    Raises `UnknownName` for an unknown name, `UsageError` for an invalid file or if nothing has an
-    effect.
+    Returns:
+        The merged condition alone; () if there are no names.
+
+    Raises:
+        UnknownName: for an unknown name.
+        UsageError: if a file is invalid, or if nothing has an effect.
     """
     if not names:
         return ()

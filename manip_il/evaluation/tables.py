@@ -22,9 +22,12 @@ _PLAIN_WIDTH = 240  # files and pipes have no width to wrap lines at
 
 @dataclass(frozen=True)
 class Table:
-    """Columns and rows of text; an empty cell means not measured. The first column names the row.
+    """Columns and rows of text; an empty cell means not measured.
 
-    colours: one per row, such as `#0072b2`; empty for none.
+    Attributes:
+        columns: The headers; the first column names the row.
+        rows: The cells of each row, as many as there are columns.
+        colours: One per row, such as `#0072b2`; empty for none.
     """
 
     columns: tuple[str, ...]

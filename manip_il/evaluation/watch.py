@@ -26,8 +26,12 @@ class WindowScreen:
 
     Objects can be dragged with the mouse.
 
-    sliders: whether the viewer's control sliders drive the robot. Raises `RenderError` if there is
-    no display.
+    Args:
+        env: The environment.
+        sliders: Whether the viewer's control sliders drive the robot.
+
+    Raises:
+        RenderError: if there is no display.
     """
 
     def __init__(self, env: ManipEnv, *, sliders: bool = False):
@@ -78,10 +82,18 @@ def outcome(step: Transition) -> str:
 
 
 class RerunLog:
-    """Steps of episodes, written to a file, or sent in real time to viewers that open `address`.
+    """Steps of episodes, written to a file, or sent in real time to viewers.
 
-    address: URL of the viewer, for a browser; empty if a file is written. ports: of the viewer and
-    of the stream. Raises `OSError` if the file cannot be written.
+    Args:
+        env: The environment.
+        output: The file; None to send the steps to viewers that open `address`.
+
+    Attributes:
+        address: URL of the viewer, for a browser; empty if a file is written.
+        ports: Ports of the viewer and of the stream; (0, 0) if a file is written.
+
+    Raises:
+        OSError: if the file cannot be written.
     """
 
     act = None  # a log does not drive the robot

@@ -28,7 +28,11 @@ _PICTURES = 100  # pictures per camera from which statistics are computed
 def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
     """Return all findings about a folder, [] for a sound dataset. Never raises.
 
-    If the folder is not a dataset, this is the only finding. more: additional checks.
+    If the folder is not a dataset, this is the only finding.
+
+    Args:
+        root: The folder.
+        more: Checks to run in addition to `CHECKS`.
     """
     found: list[Finding] = []
     try:
@@ -60,9 +64,12 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
 
     Yield one line for each repair, or for the reason why one was not possible.
 
-    Nothing is deleted: replaced and moved files are kept in `ROOT.before-repair`. Raises
-    `ManipError` if that exists, if a link leads outside, and while another process uses the
-    dataset. Check the dataset again afterwards.
+    Nothing is deleted: replaced and moved files are kept in `ROOT.before-repair`. Check the dataset
+    again afterwards.
+
+    Raises:
+        ManipError: if `ROOT.before-repair` exists, if a link leads outside, or while another
+            process uses the dataset.
     """
     kept = root.with_name(f"{root.name}.before-repair")
     if kept.exists():

@@ -147,8 +147,12 @@ def load_mapping(path: Path) -> Mapping:
 def values_at(path: str, message: Any) -> list[Any]:
     """Return the values at a path, in order; if it ends at a list, the list's elements.
 
-    message: a protobuf or ROS 2 message, or parsed JSON. Raises `ManipError` naming the part of
-    `path` that is missing.
+    Args:
+        path: The path of a field in the message.
+        message: A protobuf or ROS 2 message, or parsed JSON.
+
+    Raises:
+        ManipError: if a part of `path` is missing; the message names it.
     """
     nodes = [message]
     for selector, name in _STEP.findall(path):

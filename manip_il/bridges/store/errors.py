@@ -49,8 +49,10 @@ class RemoteError(ManipError):
 
 @contextmanager
 def explained(what: str) -> Generator[None]:
-    """Turn a library's errors into `RemoteError`. what: the attempted action, with the remote's
-    name.
+    """Turn a library's errors into `RemoteError`.
+
+    Args:
+        what: The attempted action, with the remote's name.
     """
     try:
         yield

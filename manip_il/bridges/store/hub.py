@@ -1,6 +1,4 @@
-"""A repository on the Hugging Face Hub, or the server at HF_ENDPOINT, through huggingface_hub.
-
-Its card.
+"""Push to and pull from the Hugging Face Hub, or the server at HF_ENDPOINT, and write cards.
 
 Files keep their paths, so that LeRobot reads them. A push is one commit on top of the version that
 the folder was compared with; then the tag `v3.0`, by which LeRobot finds datasets, is moved to that
@@ -118,7 +116,14 @@ def _client() -> httpx.Client:
 
 
 class Hub:
-    """A repository at a branch, tag or commit. quiet: show no progress bars."""
+    """A repository on the Hub at a branch, tag or commit.
+
+    Attributes:
+        at_once: Number of files that are transferred concurrently.
+        kind: Whether the repository holds a dataset or a policy.
+        name: The address, for messages.
+        quiet: Whether progress bars are hidden.
+    """
 
     at_once = 8  # concurrent files
 
@@ -130,7 +135,17 @@ class Hub:
         private: bool = False,
         quiet: bool = False,
     ):
-        """address: the part after `hf://`. Raises `UsageError` if it is invalid."""
+        """Parse the address of a repository, without connecting to the Hub.
+
+        Args:
+            address: The part of the URL after `hf://`.
+            revision: Branch, tag or commit, by default the one in the address or the main branch.
+            private: Whether a push creates a private repository.
+            quiet: Whether to hide progress bars.
+
+        Raises:
+            UsageError: if the address is invalid, or names another revision than `revision`.
+        """
         found = _ADDRESS.fullmatch(address)
         if not found or ".." in address or (revision and found[3] not in (None, revision)):
             text = (
@@ -266,7 +281,16 @@ class Hub:
                 self._move_tag()
 
     def download(self, manifest: Manifest, folder: Path, path: str) -> None:
-        """Download a file of a version to the same path in a folder, without checking its hash."""
+        """Download one file of a version, without checking its hash.
+
+        Args:
+            manifest: The version.
+            folder: Where the file is written, at the same path as in the repository.
+            path: The file's path in the repository.
+
+        Raises:
+            RemoteError: if the server sends more bytes than expected.
+        """
         file = manifest.files.get(path)
         most = file.size if file else checks.LARGEST_READ
         where: Any = {**self._repo, "revision": manifest.version, "local_dir": folder}

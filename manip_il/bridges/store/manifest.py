@@ -1,6 +1,6 @@
 """The files of one version of a dataset or run, with sizes and hashes.
 
-What arrives of them is counted.
+`Arrival` counts their bytes as they are downloaded.
 """
 
 from __future__ import annotations
@@ -43,7 +43,13 @@ Kind = Literal["dataset", "policy"]
 
 @dataclass(frozen=True)
 class File:
-    """Size [bytes] and hash of a file: its sha256, or its git id if the Hub provides no sha256."""
+    """Size and hash of a file.
+
+    Attributes:
+        size: Size [bytes].
+        sha256: The hash of its content; empty if the Hub provides none.
+        git_sha1: Its git id, if the Hub provides no sha256.
+    """
 
     size: int
     sha256: str = ""
@@ -82,10 +88,14 @@ class File:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Files by path. version: the version's id on the remote.
+    """The files of one version of a dataset or policy.
 
-    copies: paths at the root that repeat the files of a run's policy; they are not pulled.
-    replaced: hashes of objects that only the version before names.
+    Attributes:
+        kind: Which of them it is.
+        files: Path -> file.
+        version: The version's id on the remote.
+        copies: Paths at the root that repeat the files of a run's policy; they are not pulled.
+        replaced: Hashes of objects that only the version before names.
     """
 
     kind: Kind
@@ -126,8 +136,14 @@ class Manifest:
 
 @dataclass(frozen=True)
 class PushPlan:
-    """Difference between a folder and the remote's version (`before`). local: path -> file.
-    upload, remove: paths.
+    """The difference between a folder and a remote's version.
+
+    Attributes:
+        manifest: The version to be pushed.
+        before: The remote's version; None if there is none.
+        local: Path in the manifest -> file on this machine.
+        upload: Paths of the files to upload.
+        remove: Paths of the files to remove.
     """
 
     manifest: Manifest
@@ -187,11 +203,18 @@ def check_path(path: object) -> None:
 
 
 def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, Path]:
-    """Return the files of a dataset or run by their paths in the manifest, except hidden and
-    unfinished ones.
+    """Return the files of a dataset or run by their paths in the manifest.
 
-    journals: include a dataset's `<root>.journals`, as `journals/`, and the journals in a run.
-    Raises `RemoteError` for links.
+    Hidden and unfinished files are left out.
+
+    Args:
+        root: Folder of the dataset or run.
+        kind: Which of them it is.
+        journals: Whether to include a dataset's `<root>.journals`, as `journals/`, and the journals
+            in a run.
+
+    Raises:
+        RemoteError: for a link, unless it is a run's link to its last checkpoint.
     """
     local: dict[str, Path] = {}
     for path in sorted(root.rglob("*")):

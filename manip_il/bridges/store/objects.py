@@ -52,7 +52,17 @@ class Local(LocalFileSystem):
 
     @override
     def get_file(self, path1: Any, path2: Any, callback: Any = None, **kwargs: Any) -> None:
-        """Copy a file and count its bytes."""
+        """Copy a file and count its bytes.
+
+        Args:
+            path1: The file to copy.
+            path2: The new file.
+            callback: The `Arrival` that counts the bytes.
+            kwargs: Ignored.
+
+        Raises:
+            RemoteError: if it is not a regular file, or has more bytes than expected.
+        """
         with checks.open_outside(Path(path1), "a file of a push", RemoteError) as source:
             _copy(source, path2, callback)
 
@@ -93,13 +103,31 @@ class Sftp(SFTPFileSystem):
     def put_file(
         self, lpath: Any, rpath: Any, callback: Any = None, mode: str = "", **kwargs: Any
     ) -> None:
-        """Upload a file and make its folder."""
+        """Upload a file and make its folder.
+
+        Args:
+            lpath: The file on this machine.
+            rpath: The path on the server.
+            callback: Ignored.
+            mode: Ignored.
+            kwargs: Ignored.
+        """
         self.makedirs(self._parent(rpath), exist_ok=True)
         self.ftp.put(str(lpath), str(rpath))
 
     @override
     def get_file(self, rpath: Any, lpath: Any, callback: Any = None, **kwargs: Any) -> None:
-        """Download a file and count its bytes."""
+        """Download a file and count its bytes.
+
+        Args:
+            rpath: The path on the server.
+            lpath: The new file on this machine.
+            callback: The `Arrival` that counts the bytes.
+            kwargs: Ignored.
+
+        Raises:
+            RemoteError: if the file has more bytes than expected.
+        """
         with self.ftp.open(str(rpath)) as source:
             source.prefetch(min(source.stat().st_size or 0, callback.most))
             _copy(source, lpath, callback)
@@ -113,13 +141,27 @@ def _copy(source: Any, target: str, arrival: Arrival) -> None:
 
 
 class Objects:
-    """A folder in any file system that fsspec supports. quiet: show no progress bars."""
+    """A folder in any file system that fsspec supports.
+
+    Attributes:
+        at_once: Number of files that are transferred concurrently.
+        name: The URL without a password, for messages.
+        quiet: Whether progress bars are hidden.
+    """
 
     kind: Kind | None = None  # the address does not say which
 
     def __init__(self, scheme: str, url: str, *, quiet: bool = False):
-        """Raises `UsageError` for an unknown scheme, one whose package is not installed, or an
-        invalid address.
+        """Parse the URL of a folder, without connecting to its server.
+
+        Args:
+            scheme: The part of the URL before `://`.
+            url: The whole URL.
+            quiet: Whether to hide progress bars.
+
+        Raises:
+            UnknownName: if fsspec does not know the scheme.
+            UsageError: if the scheme's package is not installed, or the address is invalid.
         """
         self._scheme, self.quiet = scheme, quiet
         self.name = re.sub(r"(?<=://)([^/@:]*):.*@", r"\1@", url)
@@ -205,8 +247,15 @@ class Objects:
                         self._fs.rm([self._object(key) for key in unused])
 
     def download(self, manifest: Manifest, folder: Path, path: str) -> None:
-        """Download the object of a file to the file's path in a folder, without checking its
-        hash.
+        """Download the object of one file, without checking its hash.
+
+        Args:
+            manifest: The version that the file belongs to.
+            folder: Where the file is written, at its own path.
+            path: The file's path in the manifest.
+
+        Raises:
+            RemoteError: if the server sends more bytes than the manifest says.
         """
         file = manifest.files[path]
         self._fs.get_file(

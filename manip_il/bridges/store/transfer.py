@@ -1,6 +1,7 @@
-"""Push a folder to a remote, checked and visible only when complete.
+"""Push a folder to a remote, and pull it back.
 
-Pull it back, verified, in one rename.
+A push is checked first and is visible only when complete; a pull is verified, and its folder
+appears in one rename.
 """
 
 import filecmp
@@ -45,10 +46,17 @@ _OF_A_RUN = ("config.yaml", "config.json", "eval.json", "checkpoints", "best")
 def open_remote(
     url: str, *, revision: str | None = None, private: bool = False, quiet: bool = False
 ) -> Hub | Objects:
-    """Return the remote of a URL, without connecting yet. Raises `UsageError` for an invalid URL.
+    """Return the remote of a URL, without connecting to it yet.
 
-    revision: branch, tag or commit on the Hub. private: whether a push creates a private repository
-    on the Hub.
+    Args:
+        url: The address, such as `hf://datasets/USER/NAME` or `file://FOLDER`.
+        revision: Branch, tag or commit on the Hub.
+        private: Whether a push creates a private repository on the Hub.
+        quiet: Whether to hide progress bars.
+
+    Raises:
+        UnknownName: if the scheme is unknown.
+        UsageError: if the URL is invalid, or a revision is given for a remote other than the Hub.
     """
     found = _ADDRESS.fullmatch(url)
     if not found:

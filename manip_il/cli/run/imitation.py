@@ -76,9 +76,11 @@ def run_dagger(options: DaggerOptions) -> None:
 
 
 def say_best(folder: Path, words: Sequence[str] = ()) -> None:
-    """Print where a run's report and best policy are, and how to evaluate that.
+    """Print where a run's report and best policy are, and how to evaluate that policy.
 
-    words: options that the policy does not store.
+    Args:
+        folder: Folder of the run.
+        words: Options that the policy does not store.
     """
     best = folder / "best" / "pretrained_model"
     say(f"report: {folder / REPORT_FILE}", f"best policy: {best}")
@@ -365,8 +367,13 @@ def _env(options: CompareOptions, sides: Sequence[Side]) -> EnvConfig:
 
 
 class StudyPlan(NamedTuple):
-    """A checked study: options and environment of every arm, and the arm to compare others with,
-    if any.
+    """A study whose options have been checked.
+
+    Attributes:
+        file: The study's file.
+        arms: Name of an arm -> its options.
+        envs: Name of an arm -> its environment.
+        baseline: The arm that the others are compared with; None if the arms have different tasks.
     """
 
     file: StudyFile
@@ -376,8 +383,14 @@ class StudyPlan(NamedTuple):
 
 
 def run_plan(plan: StudyPlan, root: Path, engine: EngineOptions) -> None:
-    """Run the missing runs, seed by seed, so that a study that is stopped early has runs of
-    every arm.
+    """Run those runs of a study that are missing.
+
+    They are run seed by seed, so that a study that is stopped early has runs of every arm.
+
+    Args:
+        plan: The study.
+        root: Folder of the study, with one folder per arm and training seed.
+        engine: How many workers run the episodes, and where.
     """
     runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
     for number, (name, seed) in enumerate(runs, start=1):
@@ -398,9 +411,15 @@ def run_plan(plan: StudyPlan, root: Path, engine: EngineOptions) -> None:
 
 
 def read_plan(path: Path, training_seeds: int | None = None, trust: bool = False) -> StudyPlan:
-    """Return the study in `path`; raises a one-line `UsageError` if something is invalid.
+    """Return the study in a file.
 
-    training_seeds: replaces the number in the file. trust: `--trust` for every run.
+    Args:
+        path: The YAML file.
+        training_seeds: Number of training seeds, by default that in the file.
+        trust: Whether every run may load models and code that a checkpoint names.
+
+    Raises:
+        UsageError: if something in the file is invalid; the message has one line.
     """
     file = from_yaml(path, StudyFile)
     file = replace(file, training_seeds=training_seeds or file.training_seeds)
