@@ -28,6 +28,7 @@ def test_what_is_exported_is_imported_as_far_as_the_mapping_names_it(dataset, tm
     out, mapping = tmp_path / "out", tmp_path / "m.yaml"
     assert main(["data", "to-mcap", str(dataset), str(out)]) == 0
     assert (out / "mapping.yaml").is_file()
+    capsys.readouterr()
     assert (
         main(
             [
