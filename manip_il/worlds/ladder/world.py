@@ -232,9 +232,9 @@ class LadderEnv(ManipEnv, Environment):
 
     @property
     @override
-    def spec(
+    def spec(  # pyright: ignore[reportIncompatibleVariableOverride]  # of gymnasium
         self,
-    ) -> EnvironmentSpec:  # pyright: ignore[reportIncompatibleVariableOverride]  # of gymnasium
+    ) -> EnvironmentSpec:
         scene, task = self.scene, self._task
         servos = scene.robot.lerobot
         return EnvironmentSpec(
