@@ -41,6 +41,7 @@ _OPTIONS = {
     "protocol_whitelist": "file",
     "enable_drefs": "0",  # no tracks in other files
 }
+_BLOCK = 128  # largest block of pixels by which decoders enlarge pictures
 _OPEN_FILMS, _OPEN_TABLES = 32, 4  # video and data files that one process keeps open
 
 
@@ -213,6 +214,9 @@ def open_video(path: Path, size: tuple[int, int] | None = None) -> InputContaine
         container = av.open(f"file:{opened}", format="mp4", options=_OPTIONS)
     for stream in container.streams.video:
         check_size((stream.height, stream.width), size)
+        # sizes may also change within the stream
+        most = (stream.height + _BLOCK) * (stream.width + _BLOCK)
+        stream.codec_context.options = {"max_pixels": str(most)}
     return container
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from manip_il.collect.job import RolloutJob
 
 FILE_NAME = "eval.json"
+_MOST = 10**9  # of anything that is counted
 # keys of every episode, in the order of `EpisodeResult`
 _KEYS = {
     "seed": int,
@@ -82,6 +83,9 @@ class EpisodeResult:
         """
         detail = dict(data)
         values: list[Any] = [convert(detail.pop(key)) for key, convert in _KEYS.items()]
+        checks.text("condition", detail.get("condition", ""))
+        checks.mapping("drawn", detail.get("drawn", {}))
+        checks.number("steps_to_success", detail.get("steps_to_success") or 0)
         return cls(*values, detail=detail)
 
 
@@ -111,6 +115,11 @@ class EvalSettings:
     object: str = ""
 
     def __post_init__(self) -> None:
+        hold = 0 if self.hold is None else self.hold
+        for steps in (self.horizon, self.success_steps, self.control_hz, hold):
+            checks.whole("horizon, success_steps, control_hz or hold", steps, 0, _MOST)
+        checks.number("tolerance", self.tolerance)
+        checks.text("suite", self.suite)
         checks.object_name(self.object)
 
     @classmethod
@@ -300,16 +309,17 @@ class EvalResult:
 
         Raises `KeyError`, `TypeError` or `ValueError` if a value is missing or invalid.
         """
+        width = data["until_width"]
         return cls(
-            policy=data["policy"],
+            policy=checks.text("policy", data["policy"]),
             # Older files store the path of a user's own robot, which is named like its file.
             robot=checks.name("robot", PurePath(checks.text("robot", data["robot"])).stem),
             task=checks.task_name(data["task"]),
-            fingerprint=data["fingerprint"],
+            fingerprint=checks.mapping("fingerprint", data["fingerprint"]),
             episodes=tuple(map(EpisodeResult.from_json, data["episodes"])),
-            settings=EvalSettings.from_json(data["settings"]),
-            policy_sha256=data["policy_sha256"],
-            until_width=data["until_width"],
+            settings=EvalSettings.from_json(checks.mapping("settings", data["settings"])),
+            policy_sha256=checks.text("policy_sha256", data["policy_sha256"]),
+            until_width=None if width is None else checks.number("until_width", width),
         )
 
     def write(self, path: Path) -> None:

@@ -173,3 +173,36 @@ def test_a_name_that_is_none_is_refused_in_one_line(wrong, tmp_path: Path):
         with pytest.raises(ManipError) as caught:
             EvalResult.read(tmp_path)
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("wrong", [None, [1], {"a": 1}, "a/b\n", True])
+def test_a_value_of_another_kind_is_refused_in_one_line(wrong, tmp_path: Path):
+    data = result([True]).to_json()
+    fields = [
+        (data, name)
+        for name in ("policy", "robot", "task", "policy_sha256", "until_width", "fingerprint")
+    ]
+    fields += [(data["settings"], name) for name in data["settings"]]
+    fields += [(data["episodes"][0], name) for name in ("drawn", "condition", "steps_to_success")]
+    for container, name in fields:
+        before = container.get(name)
+        container[name] = wrong
+        (tmp_path / "eval.json").write_text(json.dumps(data))
+        container[name] = before if before is not None else ABSENT.get(name)
+        if fits(name, wrong):
+            continue
+        with pytest.raises(ManipError) as caught:
+            EvalResult.read(tmp_path)
+        assert "\n" not in str(caught.value)
+
+
+ABSENT = {"drawn": {}, "condition": ""}  # what not every episode has
+
+
+def fits(name: str, value: object) -> bool:
+    """Whether a field may hold one of the wrong values."""
+    text = isinstance(value, str) and name in ("policy", "policy_sha256", "suite", "condition")
+    mapping = isinstance(value, dict) and name in ("fingerprint", "drawn")
+    return (
+        text or mapping or (value is None and name in ("hold", "until_width", "steps_to_success"))
+    )
