@@ -19,6 +19,8 @@ __all__ = [
     "Dataset",
     "Expert",
     "FitConfig",
+    "GymWorld",
+    "Label",
     "LearnedPolicy",
     "RunConfig",
     "State",

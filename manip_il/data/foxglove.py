@@ -26,6 +26,7 @@ from mcap_protobuf.schema import register_schema
 from numpy.typing import NDArray
 
 from manip_il.data import schema as s
+from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.mdp import Episode
 
 U8 = NDArray[np.uint8]
@@ -122,20 +123,22 @@ def _stamp(time: int) -> Timestamp:
     return Timestamp(seconds=seconds, nanos=nanos)
 
 
-def episode_channels(episode: Episode, times: Times, joints: Sequence[str]) -> dict[str, Messages]:
+def episode_channels(episode: Episode, times: Times, spec: EnvironmentSpec) -> dict[str, Messages]:
     """Return the messages of an episode's columns.
 
     Args:
         episode: The episode, with T frames.
         times: Times of the frames [ns].
-        joints: Names of the joints.
+        spec: Names the numbers of states and actions.
 
     Returns:
         Topic -> messages, one per frame.
     """
     columns = episode.columns
     found = {
-        topic: joint_states(joints, columns[key], times)
+        topic: joint_states(
+            spec.observed_names if key == s.STATE else spec.joint_names, columns[key], times
+        )
         for topic, key in _JOINT_TOPICS.items()
         if key in columns
     }

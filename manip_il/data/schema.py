@@ -30,7 +30,15 @@ BETA = "beta"
 OWN_OBJECT = "the task's own"  # meaning of an empty object name
 LEROBOT_TYPES = {"so_follower": "so101"}  # LeRobot's `robot_type` -> our name, if it differs
 MOST_FPS = 10_000  # highest control rate [Hz]
-MUST_AGREE = ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning")
+MUST_AGREE = (
+    "robot",
+    "fps",
+    "joint_names",
+    "state_names",
+    "object",
+    "environment_state_names",
+    "action_meaning",
+)
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")  # in the name of a robot
 
 
@@ -62,7 +70,7 @@ def features(spec: EnvironmentSpec) -> dict[str, dict[str, Any]]:
         "names": ["height", "width", "channels"],
     }
     return {
-        STATE: _feature("float32", joints),
+        STATE: _feature("float32", spec.observed_names),
         ENVIRONMENT_STATE: _feature("float32", spec.environment_state_names),
         **{key: dict(pictures) for key in spec.image_keys},
         **{key: _feature("float32", points) for key in spec.keypoint_keys},

@@ -93,13 +93,14 @@ class Origin:
     look: dict[str, Any] | None = None
     datasets: list[dict[str, Any]] = field(default_factory=list)
     action_space: str | None = None
-    object: str = ""  # see `EnvironmentSpec`
+    object: str = ""  # see `EnvironmentSpec`, also for the next one
+    state_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
         checks.task_name(self.task)
         checks.object_name(self.object)
-        for name in ("joint_names", "environment_state_names", "cameras", "image_size"):
+        for name in ("joint_names", "state_names", "environment_state_names", "cameras", "image_size"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
 
     @classmethod
@@ -137,7 +138,7 @@ class Origin:
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of `manip_il.json`."""
-        return {name: value for name, value in asdict(self).items() if value or name != "object"}
+        return {name: value for name, value in asdict(self).items() if value or name not in ("object", "state_names")}
 
     def check_fits(self, spec: EnvironmentSpec) -> None:
         """Raise `MismatchError` naming both sides unless states and actions mean the same as in
@@ -303,7 +304,7 @@ class Checkpoint:
         environment, joints = f"{spec.robot}/{spec.task}", len(spec.joint_names)
         has: dict[str, Any] = {
             "robot of the inverse kinematics": spec.robot,
-            STATE: joints,
+            STATE: len(spec.observed_names),
             ACTION: joints,
         }
         has |= {ENVIRONMENT_STATE: len(spec.environment_state_names)} | dict.fromkeys(

@@ -21,7 +21,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, UsageError
-from manip_il.learn.names import EE_DELTA
+from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork, NetworkConfig
 from manip_il.learn.samples import Table, valid_frames
 
@@ -81,13 +81,15 @@ class MLPConfig(NetworkConfig, PreTrainedConfig):
 
     @override
     def validate_features(self) -> None:
-        """Raise unless `observation.state` and `action` exist and have the same size."""
+        """Raise unless `observation.state` and `action` exist, of the same size if targets are
+        relative.
+        """
         state, action = self.robot_state_feature, self.action_feature
         shapes = [None if feature is None else feature.shape for feature in (state, action)]
-        if shapes[0] is None or len(shapes[0]) != 1 or shapes[0] != shapes[1]:
+        if None in shapes or (self.action_space == JOINT_DELTA and shapes[0] != shapes[1]):
             raise UsageError(
-                f"the {self.type} policy needs observation.state and action of the same size; their"
-                f" shapes are {shapes[0]} and {shapes[1]}"
+                f"the {self.type} policy needs observation.state and action, of the same size in"
+                f" the action space {JOINT_DELTA}; their shapes are {shapes[0]} and {shapes[1]}"
             )
 
     @override
@@ -160,7 +162,11 @@ class MLPPolicy(PreTrainedPolicy):
         features = config.input_features or {}
         config.input_features = {key: features[key] for key in self.inputs}
         width = sum(features[key].shape[0] for key in self.inputs)
-        self.model = MLPNetwork(width, features[STATE].shape[0], config)
+        self.model = MLPNetwork(width, self._numbers_out(), config)
+
+    def _numbers_out(self) -> int:
+        """Return the number of values in an action."""
+        return (self.config.output_features or {})[ACTION].shape[0]
 
     def _offsets(self, places: tuple[int, ...]) -> tuple[int, ...]:
         """Return the indices among the inputs of these numbers of the environment state."""

@@ -6,17 +6,16 @@ names its task: what these store is a `str`, which is a name.
 """
 
 import hashlib
-import importlib.util
 import inspect
-import sys
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
-from manip_il.errors import OWN, UnknownName, UsageError
+from manip_il.errors import UnknownName, UsageError
 from manip_il.option import NameOrPath
+from manip_il.own_file import own_class
 from manip_il.sim.shape import ObjectShape
 from manip_il.sim.task import Task
 from manip_il.tasks.carry.task import Carry
@@ -113,30 +112,8 @@ def _entry_point(name: str) -> EntryPoint | None:
 @cache
 def _of_file(path: Path) -> Task:
     """Run a file; return its one task."""
-    if not path.is_file():
-        raise UsageError(f"{path} does not exist; expected a Python file with a task of your own")
-    name = f"{OWN}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None  # because the path ends in `.py`
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look it up there
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        del sys.modules[name]
-        raise UsageError(
-            f"{path} cannot be run: {type(error).__name__}: {checks.one_line(error)}"
-        ) from error
-    own = [one for one in vars(module).values() if inspect.isclass(one) and one.__module__ == name]
-    tasks = [cls for cls in own if issubclass(cls, Task) and not cls.__name__.startswith("_")]
-    if len(tasks) != 1:
-        found = ", ".join(one.__name__ for one in tasks) or "none"
-        raise UsageError(
-            f"tasks in {path}: {found}; expected one subclass of manip_il.task.Task"
-            " (docs/new-task.md)"
-        )
-    task = _made(f"{path}: task {tasks[0].__name__}", tasks[0])
+    cls = own_class(path, Task, "manip_il.task.Task (docs/new-task.md)")
+    task = _made(f"{path}: task {cls.__name__}", cls)
     if task.name in TASKS:
         raise UsageError(
             f"{path}: its task has a built-in task's name, {task.name!r}; choose another"

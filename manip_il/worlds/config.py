@@ -20,6 +20,7 @@ class Listed(NamedTuple):
     cameras: tuple[str, ...] = ()
 
 
+WORLD_GROUP = "manip_il.worlds"  # entry points: a world's name, and its `GymWorld`
 WORLDS: dict[NameOrPath, Listed] = {
     "fetch_stock": Listed(
         "manip_il.worlds.fetch.expert",
@@ -32,9 +33,16 @@ WORLDS: dict[NameOrPath, Listed] = {
         ("AlohaTransferCube-v0", "AlohaInsertion-v0"),
         ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist"),
     ),
+    "metaworld": Listed(
+        "manip_il.worlds.metaworld",
+        "Meta-World's Sawyer",
+        ("any of its fifty, as in peg-insert-side-v3",),
+        ("corner2",),
+    ),
 }
 ROBOT_HELP = (
-    f"{', '.join(ROBOTS)}, the path of your own arm's YAML, or, unmodified, "
+    f"{', '.join(ROBOTS)}, the path of your own arm's YAML or your own world's Python file, or,"
+    " unmodified, "
     f"{', '.join(f'{name} ({world.about})' for name, world in WORLDS.items())}"
 )
 TASK_HELP = (
@@ -56,8 +64,8 @@ class EnvConfig(Episodes):
             a mesh; empty for the task's default.
     """
 
-    robot: NameOrPath = option("panda", ROBOT_HELP, flag="robot.type")
-    task: NameOrPath = option("pick_place", TASK_HELP, flag="task.type")
+    robot: NameOrPath = option("panda", ROBOT_HELP, flag="robot.type", alias="env.type")
+    task: NameOrPath = option("pick_place", TASK_HELP, flag="task.type", alias="env.task")
     object: NameOrPath = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
 
     @property
