@@ -63,6 +63,7 @@ def robot_of(robot_type: str) -> dict[str, str]:
 def features(spec: EnvironmentSpec) -> dict[str, dict[str, Any]]:
     """Return LeRobot's feature table for our columns (LeRobot adds its own index columns)."""
     joints, pictured = list(spec.joint_names), "video" if spec.video else "image"
+    around = spec.environment_state_names
     points = [f"{name}.{what}" for name in spec.keypoints for what in ("across", "down", "in_view")]
     pictures = {
         "dtype": pictured,
@@ -71,7 +72,7 @@ def features(spec: EnvironmentSpec) -> dict[str, dict[str, Any]]:
     }
     return {
         STATE: _feature("float32", spec.observed_names),
-        ENVIRONMENT_STATE: _feature("float32", spec.environment_state_names),
+        **({ENVIRONMENT_STATE: _feature("float32", around)} if around else {}),
         **{key: dict(pictures) for key in spec.image_keys},
         **{key: _feature("float32", points) for key in spec.keypoint_keys},
         ACTION: _feature("float32", joints),

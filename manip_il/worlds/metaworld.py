@@ -7,6 +7,7 @@ learning". What is trained here is measured by `lerobot-eval --env.type=metaworl
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
@@ -101,6 +102,8 @@ Metaworld.tasks = tuple(_known()["TASK_POLICY_MAPPING"])
 
 
 def _package(name: str) -> Any:
+    # its scripts warn of commands that they expect to be clipped
+    warnings.filterwarnings("ignore", module=r"metaworld\.")
     try:
         return import_module(name)
     except ModuleNotFoundError as error:

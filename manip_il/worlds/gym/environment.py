@@ -42,7 +42,7 @@ from manip_il.worlds.gym.restoring import Simulated, flat, simulation, unflat
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 
 SEEDS = 4  # episodes that are begun to see what is part of a state
-_MOST_SEED = 2**31  # gymnasium's environments take none that is larger
+_MOST_SEED = 2**32  # older environments take none that is larger
 _TOLERANCE = 0.05  # [m]; not used, as such a world says by itself what is solved
 
 
@@ -79,11 +79,13 @@ class GymEnv(Environment):
         self.env = world.make()
         self.actions = _actions(world, self.env.action_space)
         simulated = simulation(self.env)
-        self._simulated = None
+        self._simulated, self._fresh = None, np.empty(0)
         self._is_own = _overrides(world, "restore")
         self.start(0)
         if simulated and not self._is_own:
             self._simulated = self._found_state(*simulated)
+            self._fresh = self._simulated.get()
+            self.start(0)
         self._numbers = flat(self._seen)
         self._spec = self._described(horizon)
         self._spec = replace(self._spec, sim_state_size=len(self.get_state().to_vector()))
@@ -102,6 +104,8 @@ class GymEnv(Environment):
 
     @override
     def start(self, seed: int) -> None:
+        if self._simulated:  # nothing is left of an earlier episode
+            self._simulated.set(self._fresh)
         self._seen, self._info = self.world.reset(self.env, seed % _MOST_SEED)
         self._count(0, 0, False)
         self._solved, self._label = False, None
@@ -200,7 +204,6 @@ class GymEnv(Environment):
             found.look()
             self.env.step(middle.astype(self.env.action_space.dtype))
             found.look()
-        self.start(0)
         return found
 
     def _described(self, horizon: int) -> EnvironmentSpec:

@@ -59,7 +59,7 @@ class GymWorld:
 
         Args:
             env: The environment that `make` returned.
-            seed: The episode's seed, below 2**31.
+            seed: The episode's seed, below 2**32.
 
         Returns:
             What the environment's `reset` returns: its observation and `info`.
