@@ -16,8 +16,9 @@ class Listed(NamedTuple):
 
     module: str
     about: str
-    tasks: tuple[str, ...]
+    tasks: tuple[str, ...]  # some of them, if there are `others`
     cameras: tuple[str, ...] = ()
+    others: int = 0
 
 
 WORLD_GROUP = "manip_il.worlds"  # entry points: a world's name, and its `GymWorld`
@@ -36,10 +37,18 @@ WORLDS: dict[NameOrPath, Listed] = {
     "metaworld": Listed(
         "manip_il.worlds.metaworld",
         "Meta-World's Sawyer",
-        ("any of its fifty, as in peg-insert-side-v3",),
+        ("push-v3", "peg-insert-side-v3"),
         ("corner2",),
+        others=48,
     ),
 }
+
+
+def _listed(world: Listed) -> str:
+    others = (f"{world.others} others",) if world.others else ()
+    return ", ".join(world.tasks + others)
+
+
 ROBOT_HELP = (
     f"{', '.join(ROBOTS)}, the path of your own arm's YAML or your own world's Python file, or,"
     " unmodified, "
@@ -47,7 +56,7 @@ ROBOT_HELP = (
 )
 TASK_HELP = (
     f"{', '.join((*NAMES, *SEVERAL))}, or the path of your own task's Python file; "
-    f"{'; '.join(f'with {name}, ' + ', '.join(world.tasks) for name, world in WORLDS.items())}"
+    f"{'; '.join(f'with {name}, ' + _listed(world) for name, world in WORLDS.items())}"
 )
 
 

@@ -88,7 +88,7 @@ class Metaworld(GymWorld):
 
     @override
     def positions(self, env: Any) -> dict[str, F64]:
-        return {"hand": env.tcp_center}
+        return {"hand": env.tcp_center, "object": env._get_pos_objects()[:3]}
 
     @override
     def render(self, env: Any, camera: str, cameras: CameraConfig) -> NDArray[np.uint8]:
@@ -110,4 +110,16 @@ def _package(name: str) -> Any:
         raise ManipError(f"metaworld needs {error.name}, which is not installed: {INSTALL}") from error
 
 
-WORLD = GymKind(Metaworld)
+class MetaworldKind(GymKind):
+    """Meta-World's tasks, which LeRobot's evaluator also runs."""
+
+    @override
+    def own_files(self, spec: Any, shape: str) -> list[str]:
+        return [] if spec.task in Metaworld.tasks else ["--env.task=TASK"]
+
+    @override
+    def lerobot_words(self, robot: str, task: str) -> list[str]:
+        return ["--env.type=metaworld", f"--env.task={task}"]
+
+
+WORLD = MetaworldKind(Metaworld)

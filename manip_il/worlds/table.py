@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 FIELDS = {
     "--env.type": "robot",
     "--robot.type": "robot",
+    "--env.task": "task",
     "--task.type": "task",
     "--task.object": "object",
 }

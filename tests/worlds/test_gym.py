@@ -60,8 +60,8 @@ RECURRENT = """
 """
 
 
-def config(folder: Path, text: str) -> EnvConfig:
-    path = folder / "own.py"
+def config(folder: Path, text: str, name: str = "own.py") -> EnvConfig:
+    path = folder / name
     path.write_text(text)
     return make_config(str(path))
 
@@ -111,7 +111,7 @@ def test_states_that_cannot_be_restored_are_recorded_but_not_labelled_again(tmp_
     manip_il.record(tmp_path / "demos", env, 3, workers=1)
     with pytest.raises(UsageError, match=r"^point cannot be restored; record again"):
         open_source(tmp_path / "demos", robot=env.robot)
-    assert env_spec(config(tmp_path, POINT + STATE)).can == ("restored",)
+    assert env_spec(config(tmp_path, POINT + STATE, "other.py")).can == ("restored",)
 
 
 def test_an_expert_with_memory_is_asked_once_in_every_step(tmp_path):

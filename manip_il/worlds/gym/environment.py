@@ -279,6 +279,8 @@ class GymKind(WorldKind):
     @override
     def complete(self, config: EnvConfig) -> EnvConfig:
         task = self._task(config)
+        if isinstance(config.robot, Path):
+            checks.check_unchanged(config.robot)
         if config.object:
             raise UsageError(
                 f"object is {config.object}; {_name(self._cls)} has its own, so omit --task.object"
