@@ -42,7 +42,5 @@ def own_class[T](path: Path, base: type[T], wanted: str) -> type[T]:
     found = [cls for cls in own if issubclass(cls, base) and not cls.__name__.startswith("_")]
     if len(found) != 1:
         names = ", ".join(cls.__name__ for cls in found) or "none"
-        raise UsageError(
-            f"{base.__name__}s in {path}: {names}; expected one subclass of {wanted}"
-        )
+        raise UsageError(f"{base.__name__}s in {path}: {names}; expected one subclass of {wanted}")
     return found[0]

@@ -14,7 +14,14 @@ from manip_il.data.schema import check_same_spec
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.table import FIELDS, complete, env_fingerprint, env_spec, stored_config, world_of
+from manip_il.worlds.table import (
+    FIELDS,
+    complete,
+    env_fingerprint,
+    env_spec,
+    stored_config,
+    world_of,
+)
 
 _LOG = logging.getLogger(__name__)
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")

@@ -26,8 +26,8 @@ from mcap_protobuf.schema import register_schema
 from numpy.typing import NDArray
 
 from manip_il.data import schema as s
-from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.mdp import Episode
+from manip_il.worlds.contract import EnvironmentSpec
 
 U8 = NDArray[np.uint8]
 Times = Sequence[int]  # [ns], one per frame

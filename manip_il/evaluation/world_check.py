@@ -129,8 +129,8 @@ def _labels(config: EnvConfig, env: Environment, other: Environment, seeds: rang
             return Check(
                 "labels",
                 f"the expert answers differently in the same state (seed {seed})",
-                "let it depend on `seen` and the state alone (poses in MuJoCo's data are those before"
-                " the last physics step), or say `recurrent = True`",
+                "let it depend on `seen` and the state alone (poses in MuJoCo's data are those"
+                " before the last physics step), or say `recurrent = True`",
             )
     return Check("labels", "a function of the state; labelling changes nothing")
 
@@ -139,24 +139,26 @@ def _episodes(
     config: EnvConfig, env: Environment, seeds: range, step: Callable[[], None]
 ) -> Iterator[Check]:
     """Yield the expert's success, and the time of steps and labels."""
-    expert, solved, invalid, taken = make_expert(config), 0, 0, list[int]()
+    expert, taken = make_expert(config), list[int]()
+    solved = invalid = 0
     spent = {"step": 0.0, "label": 0.0}
     for seed in seeds:
         env.start(seed)
-        for number in range(config.horizon):
+        steps, has_ended = 0, False
+        while steps < config.horizon and not has_ended:
             env.observe()
             state = env.get_state()
             begin = time.perf_counter()
             label = expert.label(state, env)
             middle = time.perf_counter()
             outcome = env.step(label.action)
+            steps += 1
+            has_ended = outcome.solved or outcome.ended
+            solved += outcome.solved
             spent["label"] += middle - begin
             spent["step"] += time.perf_counter() - middle
             invalid += not label.valid
-            if outcome.solved or outcome.ended:
-                break
-        solved += outcome.solved
-        taken.append(number + 1)
+        taken.append(steps)
         step()
     if not seeds:
         return

@@ -100,7 +100,8 @@ class Origin:
         checks.name("robot", self.robot)
         checks.task_name(self.task)
         checks.object_name(self.object)
-        for name in ("joint_names", "state_names", "environment_state_names", "cameras", "image_size"):
+        names = ("joint_names", "state_names", "environment_state_names")
+        for name in (*names, "cameras", "image_size"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
 
     @classmethod
@@ -138,7 +139,11 @@ class Origin:
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of `manip_il.json`."""
-        return {name: value for name, value in asdict(self).items() if value or name not in ("object", "state_names")}
+        return {
+            name: value
+            for name, value in asdict(self).items()
+            if value or name not in ("object", "state_names")
+        }
 
     def check_fits(self, spec: EnvironmentSpec) -> None:
         """Raise `MismatchError` naming both sides unless states and actions mean the same as in

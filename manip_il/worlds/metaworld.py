@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from manip_il.errors import ManipError
 from manip_il.mdp import F64
+from manip_il.sim.config import CameraConfig
 from manip_il.worlds.gym.drawing import painted
 from manip_il.worlds.gym.environment import GymKind
 from manip_il.worlds.gym.restoring import simulation
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
-from manip_il.sim.config import CameraConfig
 
 INSTALL = "pip install --no-deps metaworld==3.0.0"
 SEED = 42  # of the task that LeRobot's environment takes
@@ -107,7 +107,9 @@ def _package(name: str) -> Any:
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
-        raise ManipError(f"metaworld needs {error.name}, which is not installed: {INSTALL}") from error
+        raise ManipError(
+            f"metaworld needs {error.name}, which is not installed: {INSTALL}"
+        ) from error
 
 
 class MetaworldKind(GymKind):

@@ -174,7 +174,10 @@ def test_a_mistake_is_one_line(tmp_path, change, said, capsys):
     [
         (POINT.replace("self.np_random", "np.random.default_rng()"), "starts, labels"),
         (POINT + STATE.replace("return env.at", "return env.at + 1"), "states"),
-        (POINT.replace("np.clip(-seen, -1, 1)", "np.random.default_rng().uniform(-1, 1, 1)"), "labels"),
+        (
+            POINT.replace("np.clip(-seen, -1, 1)", "np.random.default_rng().uniform(-1, 1, 1)"),
+            "labels",
+        ),
     ],
 )
 def test_what_breaks_the_contract_is_found(tmp_path, text, what, capsys):
@@ -182,7 +185,9 @@ def test_what_breaks_the_contract_is_found(tmp_path, text, what, capsys):
     assert main(["env", "check", str(tmp_path / "own.py"), "--episodes=0", "--quiet"]) == 1
     captured = capsys.readouterr()
     assert captured.err.endswith(f"does not keep the contract: {what}\n")
-    assert any(line.startswith(f"NOT {what.partition(',')[0]}: ") for line in captured.out.splitlines())
+    assert any(
+        line.startswith(f"NOT {what.partition(',')[0]}: ") for line in captured.out.splitlines()
+    )
 
 
 def test_a_world_without_a_task_of_that_name_lists_its_own():

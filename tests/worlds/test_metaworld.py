@@ -11,7 +11,11 @@ from manip_il.sim.config import CameraConfig, Look
 from manip_il.worlds.metaworld import CAMERA, Metaworld
 from manip_il.worlds.table import make_config, make_env, make_expert
 
-TASKS = ("pick-place-v3", "door-open-v3", "bin-picking-v3")  # objects, furniture, and memory in None
+TASKS = (
+    "pick-place-v3",
+    "door-open-v3",
+    "bin-picking-v3",
+)  # objects, furniture, and memory in None
 
 
 def test_all_fifty_are_known_by_lerobots_names():

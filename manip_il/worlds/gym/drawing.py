@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,9 +17,6 @@ from manip_il.sim.render import REMEDY
 from manip_il.sim.view import simplify_meshes
 from manip_il.worlds.gym.restoring import model_arrays, simulation
 from manip_il.worlds.gym.world import GymWorld
-
-if TYPE_CHECKING:
-    from manip_il.worlds.gym.environment import GymEnv
 
 VERSION = 1  # changes when pictures do
 RENDER = ("render",)  # the camera of an environment that draws itself
@@ -40,11 +37,12 @@ def camera_names(env: Any) -> tuple[str, ...]:
     return RENDER if env.render_mode == "rgb_array" else ()
 
 
-def draw(env: GymEnv, camera: str, cameras: CameraConfig) -> NDArray[np.uint8]:
+def draw(world: GymWorld, env: Any, camera: str, cameras: CameraConfig) -> NDArray[np.uint8]:
     """Return a picture of an environment's present state, (height, width, 3).
 
     Args:
-        env: The environment.
+        world: The world.
+        env: Its environment.
         camera: Name of the camera.
         cameras: Size and look of the picture; of the look, shadows alone.
 
@@ -52,16 +50,15 @@ def draw(env: GymEnv, camera: str, cameras: CameraConfig) -> NDArray[np.uint8]:
         RenderError: if there is no off-screen OpenGL.
         UsageError: if `render` of the world or its environment returned something else.
     """
-    world = env.world
-    picture: Any = world.render(env.env, camera, cameras)
-    if picture is None and (found := simulation(env.env)) and (camera,) != RENDER:
+    picture: Any = world.render(env, camera, cameras)
+    if picture is None and (found := simulation(env)) and (camera,) != RENDER:
         return painted(type(world), world.task, found, camera, cameras)
     if picture is None:
-        picture = env.env.render()
+        picture = env.render()
     picture = np.asarray(picture)
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[-1] != 3:
         raise UsageError(
-            f"render of {env.spec.robot} returned {picture.dtype} of shape {picture.shape};"
+            f"render of {type(world).__name__} returned {picture.dtype} of shape {picture.shape};"
             " expected uint8 (height, width, 3)"
         )
     if picture.shape[:2] != cameras.size:
@@ -86,20 +83,21 @@ def painted(
         camera: Name of the camera in the model.
         cameras: Size and look of the picture; of the look, shadows alone.
     """
-    painter = _painter(cls, task, cameras.size, cameras.look.shadows)
+    painter = _painter(cls, task, cameras)
     return painter.picture(*simulated, camera)
 
 
 class _Painter:
-    def __init__(self, model: mujoco.MjModel, size: tuple[int, int], *, shadows: bool):
+    def __init__(self, model: mujoco.MjModel, cameras: CameraConfig):
         self._model: Any = copy.copy(model)
         simplify_meshes(self._model, _CELL)
         self._model.vis.quality.offsamples = 0
-        if not shadows:
+        if not cameras.look.shadows:
             self._model.vis.quality.shadowsize = 0
-        height, width = (_FINER * side for side in size)
+        height, width = (_FINER * side for side in cameras.size)
         whole = self._model.vis.global_
-        whole.offwidth, whole.offheight = max(whole.offwidth, width), max(whole.offheight, height)
+        whole.offwidth = max(whole.offwidth, width)
+        whole.offheight = max(whole.offheight, height)
         self._data = mujoco.MjData(self._model)
         self._arrays = [name for name in model_arrays(model) if name.startswith(_SEEN)]
         try:
@@ -121,10 +119,10 @@ class _Painter:
 
 
 @cached_per_thread(4)
-def _painter(cls: type[GymWorld], task: str, size: tuple[int, int], shadows: bool) -> _Painter:  # noqa: FBT001
+def _painter(cls: type[GymWorld], task: str, cameras: CameraConfig) -> _Painter:
     """What draws a world's states in this thread, for any number of its environments."""
     env = cls(task).make()
     env.reset(seed=0)
     model, _ = simulation(env) or (None, None)
     assert model is not None  # `draw` has seen it
-    return _Painter(model, size, shadows=shadows)
+    return _Painter(model, cameras)

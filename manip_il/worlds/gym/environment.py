@@ -72,9 +72,7 @@ class GymEnv(Environment):
             should.
     """
 
-    def __init__(
-        self, world: GymWorld, cameras: CameraConfig | None = None, horizon: int = 0
-    ):
+    def __init__(self, world: GymWorld, cameras: CameraConfig | None = None, horizon: int = 0):
         self.world, self._cameras = world, cameras
         self.env = world.make()
         self.actions = _actions(world, self.env.action_space)
@@ -115,7 +113,10 @@ class GymEnv(Environment):
         found = self._numbers_seen()
         pictures = {}
         if self._cameras is not None:
-            pictures = {name: draw(self, name, self._cameras) for name in self._cameras.names}
+            pictures = {
+                name: draw(self.world, self.env, name, self._cameras)
+                for name in self._cameras.names
+            }
         return Observation(*found, pictures, self.world.text(self.env))
 
     @override
@@ -213,10 +214,9 @@ class GymEnv(Environment):
         if cameras is None:
             cameras = camera_names(env)
         restores = (self._simulated or self._is_own) and self._numbers is not None
-        can = [
-            *(["restored"] if restores and not world.recurrent else []),
-            *(["drawn"] if cameras else []),
-        ]
+        can = list[Ability](["drawn"] if cameras else [])
+        if restores and not world.recurrent:
+            can.insert(0, "restored")
         settings = settings_of(world, env)
         return EnvironmentSpec(
             robot=_name(world),
@@ -231,7 +231,7 @@ class GymEnv(Environment):
             phases=world.phases,
             expert="recurrent" if world.recurrent else "stateless",
             horizon=horizon or settings["horizon"],
-            can=tuple[Ability, ...](can),
+            can=tuple(can),
             all_cameras=cameras,
             default_cameras=cameras[:1],
             ends_solved=True,

@@ -22,9 +22,9 @@ def simulation(env: Any) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
     any other.
     """
     inner = env.unwrapped
-    physics = getattr(getattr(inner, "_env", inner), "physics", inner)
-    model, data = (getattr(getattr(physics, name, None), "ptr", None) for name in ("model", "data"))
-    model, data = model or getattr(physics, "model", None), data or getattr(physics, "data", None)
+    physics: Any = getattr(getattr(inner, "_env", inner), "physics", inner)
+    found: list[Any] = [getattr(physics, name, None) for name in ("model", "data")]
+    model, data = (getattr(one, "ptr", one) for one in found)
     return (model, data) if isinstance(model, mujoco.MjModel) else None
 
 
@@ -72,8 +72,9 @@ class Simulated:
                 found.append(np.array([value is not None]))
                 value = np.zeros_like(like) if value is None else value
             if np.shape(value) != np.shape(like):
+                layer, name = place
                 raise ManipError(
-                    f"{place[1]} of {type(place[0]).__name__} had the shape {np.shape(like)} and has"
+                    f"{name} of {type(layer).__name__} had the shape {np.shape(like)} and has"
                     f" {np.shape(value)}; give the world its own `state` and `restore`"
                 )
             found.append(np.ravel(value))

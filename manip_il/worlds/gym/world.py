@@ -44,7 +44,7 @@ class GymWorld:
     horizon: int = 0
     phases: tuple[str, ...] = ("none", "act")
     cameras: tuple[str, ...] | None = None
-    names: Mapping[str, tuple[str, ...]] = {}  # noqa: RUF012  # read alone
+    names: Mapping[str, tuple[str, ...]] = {}  # read alone
     recurrent: bool = False
 
     def __init__(self, task: str = ""):
