@@ -83,7 +83,8 @@ class Option:
         metadata: `help`, one line; `positional` for a value without a name; `command_line_only` for
             an option that no file may set; `exists` for a path that must exist, with its prefix on
             the Hub (`datasets/`); `flag`, the full name; `alias`, another one; `at_least` and
-            `at_most`; `free` and `grows` for an option that a resumed run may change (see `check_same_options`).
+            `at_most`; `free` and `grows` for an option that a resumed run may change (see
+            `check_same_options`).
         is_given: Whether it is an option of another class, see `given`.
     """
 

@@ -192,4 +192,5 @@ def _action(env: Environment, seed: int, number: int) -> F64:
 def _whole(env: Environment) -> F64:
     """Return everything that can be read of an environment, (m,)."""
     seen = env.observe()
-    return np.concatenate([seen.state, seen.environment_state, env.get_state().to_vector()])
+    numbers = np.concatenate([seen.state, seen.environment_state])
+    return np.append(numbers.astype(np.float64), env.get_state().to_vector())
