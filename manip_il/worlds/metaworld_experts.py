@@ -1,0 +1,172 @@
+"""Experts of Meta-World's tasks in which the scripts of the package fail or do not recover.
+
+Each is a stateless ladder over the 39 numbers that are seen: the hand (3,) [m], the opening of the
+gripper as a share, the object (3,) [m] and its quaternion (4,), the same 18 of the step before,
+and the goal (3,) [m].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from manip_il.mdp import F64
+
+GAIN = 15.0  # action for an error of the hand [1/m]
+LAG = 2.0  # steps that the hand is behind its command
+OPEN, CLOSED = -1.0, 1.0
+CLEARANCE = 0.1  # of the hand above what it approaches [m]
+GAP = 0.85  # opening above which nothing is held
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def reach(seen: F64, target: F64, effort: float, gain: float = GAIN) -> F64:
+    """Return the action that moves the hand to a target.
+
+    Args:
+        seen: The observation, (39,).
+        target: Place of the hand, (3,) [m].
+        effort: Of the gripper, -1 (opens) to 1 (closes).
+        gain: Action for an error of the hand [1/m].
+
+    Returns:
+        The action, (4,), between -1 and 1.
+    """
+    hand, before = seen[:3], seen[18:21]
+    error = target - hand - LAG * (hand - before)
+    return np.clip(np.append(gain * error, effort), -1.0, 1.0)
+
+
+def grasp(seen: F64, at: F64, carried: F64, near: float = 0.02, deep: float = 0.02) -> F64:
+    """Return the action that grasps an object, or carries it if it is held.
+
+    A hand that is not around the object opens and goes above it, however it got there.
+
+    Args:
+        seen: The observation, (39,).
+        at: Place of the hand in which it grasps, (3,) [m].
+        carried: Target of the hand if the object is held, (3,) [m].
+        near: Most error of the hand in the plane [m].
+        deep: Most error of the hand in height [m].
+    """
+    opening, closing = seen[3], seen[21] - seen[3]
+    error = seen[:3] - at
+    apart = float(np.hypot(*error[:2]))
+    if apart < near and abs(error[2]) < deep:
+        held = opening < GAP and closing < 0.01
+        return reach(seen, carried if held else at, CLOSED)
+    clear = np.clip(max(apart / near - 0.8, 5 * (GAP - opening)), 0, 1)
+    return reach(seen, at + CLEARANCE * clear * UP, OPEN)
+
+
+def over(seen: F64, point: F64, goal: F64, height: float, near: float = 0.02) -> F64:
+    """Return the hand's target to carry a point of a held object over a goal, then down to it.
+
+    Args:
+        seen: The observation, (39,).
+        point: Place of the point, (3,) [m].
+        goal: Where it shall be, (3,) [m].
+        height: Of the way above the goal [m].
+        near: Distance in the plane within which it is lowered [m].
+    """
+    left = goal - point
+    if np.hypot(*left[:2]) > near:
+        left[2] += height
+        left[:2] *= np.clip(1 - 20 * left[2], 0, 1)  # first up
+    return seen[:3] + left
+
+
+def axis(w: float, x: float, y: float, z: float, column: int) -> F64:
+    """Return an axis of a rotated frame, (3,)."""
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )[column]
+
+
+def assembly(seen: F64) -> F64:
+    """Put the wrench's ring over the peg."""
+    wrench = seen[4:7]
+    ring = wrench + 0.13 * axis(*seen[7:11], 1)
+    to = over(seen, ring, seen[36:39] - 0.05 * UP, 0.12, 0.012)
+    return grasp(seen, wrench + (-0.015, 0, 0.047), to)
+
+
+def disassemble(seen: F64) -> F64:
+    """Lift the wrench off the peg."""
+    return grasp(seen, seen[4:7] + (-0.02, 0, 0.045), seen[:3] + 0.1 * UP)
+
+
+def basketball(seen: F64) -> F64:
+    """Carry the ball into the hoop."""
+    ball = seen[4:7]
+    return grasp(seen, ball + 0.035 * UP, over(seen, ball, seen[36:39], 0.07), 0.03)
+
+
+def hammer(seen: F64) -> F64:
+    """Hit the nail with the hammer's head."""
+    tool = seen[4:7]
+    left = np.array([0.078, 0.75, 0.125]) - tool
+    if abs(left[0]) + abs(left[2]) > 0.02:
+        left[1] = 0.45 - tool[1]
+    return grasp(seen, tool + (-0.025, 0, 0.038), seen[:3] + left)
+
+
+def hand_insert(seen: F64) -> F64:
+    """Carry the block down into the hole."""
+    block, goal = seen[4:7], seen[36:39]
+    return grasp(seen, block + 0.04 * UP, over(seen, block, goal - 0.03 * UP, 0.1))
+
+
+def _mug(seen: F64) -> F64:
+    x, y, z, w = seen[7:11]
+    mug = seen[4:7]
+    to = seen[:3] + seen[36:39] - mug + 0.01 * UP
+    return grasp(seen, mug + 0.05 * axis(w, x, y, z, 2) + 0.015 * UP, to, 0.03)
+
+
+def box_close(seen: F64) -> F64:
+    """Put the lid on the box."""
+    lid, box = seen[4:7], seen[36:39]
+    return grasp(seen, lid + 0.07 * UP, over(seen, lid, box, 0.05))
+
+
+def peg_insert(seen: F64) -> F64:
+    """Push the peg into the hole."""
+    peg, goal = seen[4:7], seen[36:39]
+    left = goal - (0.1, 0, 0) - peg
+    if np.hypot(*left[1:]) > 0.01:
+        left[0] = max(0.03 - peg[0], 0)
+    return grasp(seen, peg + 0.02 * UP, seen[:3] + left, 0.03)
+
+
+def push(seen: F64) -> F64:
+    """Push a grasped object to the goal."""
+    thing = seen[4:7]
+    return grasp(seen, thing + 0.03 * UP, seen[:3] + seen[36:39] - thing, 0.03)
+
+
+def bin_picking(seen: F64) -> F64:
+    """Carry the cube into the other bin."""
+    cube, goal = seen[4:7], seen[36:39]
+    return grasp(seen, cube + 0.04 * UP, over(seen, cube, goal, 0.15, 0.03))
+
+
+EXPERTS: dict[str, Callable[[F64], F64]] = {
+    "assembly-v3": assembly,
+    "basketball-v3": basketball,
+    "bin-picking-v3": bin_picking,
+    "box-close-v3": box_close,
+    "coffee-pull-v3": _mug,
+    "coffee-push-v3": _mug,
+    "disassemble-v3": disassemble,
+    "hammer-v3": hammer,
+    "hand-insert-v3": hand_insert,
+    "peg-insert-side-v3": peg_insert,
+    "push-back-v3": push,
+    "sweep-into-v3": push,
+}
