@@ -15,6 +15,7 @@ from manip_il.mdp import F64
 
 GAIN = 15.0  # action for an error of the hand [1/m]
 LAG = 2.0  # steps that the hand is behind its command
+LEAD = 6.0  # steps that the hand aims ahead of an object that rolls
 OPEN, CLOSED = -1.0, 1.0
 CLEARANCE = 0.1  # of the hand above what it approaches [m]
 GAP = 0.85  # opening above which nothing is held
@@ -51,13 +52,14 @@ def grasp(seen: F64, at: F64, carried: F64, near: float = 0.02, deep: float = 0.
         deep: Most error of the hand in height [m].
     """
     opening, closing = seen[3], seen[21] - seen[3]
+    moved = seen[4:7] - seen[22:25]
     error = seen[:3] - at
     apart = float(np.hypot(*error[:2]))
     if apart < near and abs(error[2]) < deep:
         held = opening < GAP and closing < 0.01
         return reach(seen, carried if held else at, CLOSED)
     clear = np.clip(max(apart / near - 0.8, 5 * (GAP - opening)), 0, 1)
-    return reach(seen, at + CLEARANCE * clear * UP, OPEN)
+    return reach(seen, at + LEAD * moved + CLEARANCE * clear * UP, OPEN)
 
 
 def over(seen: F64, point: F64, goal: F64, height: float, near: float = 0.02) -> F64:
@@ -98,7 +100,8 @@ def assembly(seen: F64) -> F64:
 
 def disassemble(seen: F64) -> F64:
     """Lift the wrench off the peg."""
-    return grasp(seen, seen[4:7] + (-0.02, 0, 0.045), seen[:3] + 0.1 * UP)
+    at = seen[4:7] + 0.02 * axis(*seen[7:11], 1) + 0.04 * UP
+    return grasp(seen, at, seen[:3] + 0.1 * UP, 0.02, 0.025)
 
 
 def basketball(seen: F64) -> F64:
@@ -119,7 +122,7 @@ def hammer(seen: F64) -> F64:
 def hand_insert(seen: F64) -> F64:
     """Carry the block down into the hole."""
     block, goal = seen[4:7], seen[36:39]
-    return grasp(seen, block + 0.04 * UP, over(seen, block, goal - 0.03 * UP, 0.1))
+    return grasp(seen, block + 0.04 * UP, over(seen, block, goal - 0.03 * UP, 0.1), 0.02, 0.03)
 
 
 def _mug(seen: F64) -> F64:
@@ -156,6 +159,57 @@ def bin_picking(seen: F64) -> F64:
     return grasp(seen, cube + 0.04 * UP, over(seen, cube, goal, 0.15, 0.03))
 
 
+def wall(seen: F64) -> F64:
+    """Carry the object over the wall."""
+    thing, goal = seen[4:7], seen[36:39]
+    return grasp(seen, thing + 0.03 * UP, over(seen, thing, goal, 0.3 - goal[2]))
+
+
+def shelf_place(seen: F64) -> F64:
+    """Put the block on the shelf."""
+    block, goal = seen[4:7], seen[36:39]
+    return grasp(seen, block + 0.03 * UP, over(seen, block, goal, 0.03))
+
+
+def pick_out(seen: F64) -> F64:
+    """Lift the puck out of the hole."""
+    puck, goal = seen[4:7], seen[36:39]
+    return grasp(seen, puck + 0.03 * UP, over(seen, puck, goal, 0.0))
+
+
+def peg_unplug(seen: F64) -> F64:
+    """Pull the peg out."""
+    return grasp(seen, seen[4:7] + (-0.02, 0, 0.02), seen[:3] + (0.1, 0, 0))
+
+
+def stick_push(seen: F64) -> F64:
+    """Push the bottle with the stick."""
+    stick, bottle, goal = seen[4:7], seen[11:14], seen[36:39]
+    left = bottle - stick
+    if abs(left[1]) + abs(left[2]) > 0.02:
+        left[0] = 0
+    else:
+        left = goal - bottle + (0.05, 0, 0)
+    return grasp(seen, stick + (0.015, 0, 0.03), seen[:3] + left)
+
+
+def handle_pull_side(seen: F64) -> F64:
+    """Pull the handle up."""
+    return grasp(seen, seen[4:7], seen[:3] + 0.1 * UP, 0.03, 0.03)
+
+
+def door_open(seen: F64) -> F64:
+    """Pull the door open by its handle, from behind it."""
+    hand, handle = seen[:3], seen[4:7]
+    behind = handle + (0.01, 0.02, 0)
+    error = hand - behind
+    apart = np.hypot(*error[:2])
+    if abs(error[2]) < 0.04 and apart < 0.07 and error[0] > -0.05:
+        return reach(seen, handle - (0.05, 0, 0), CLOSED)
+    clear = np.clip(apart / 0.02 - 0.8, 0, 1)
+    return reach(seen, behind + 0.15 * clear * UP, CLOSED)
+
+
 EXPERTS: dict[str, Callable[[F64], F64]] = {
     "assembly-v3": assembly,
     "basketball-v3": basketball,
@@ -164,9 +218,20 @@ EXPERTS: dict[str, Callable[[F64], F64]] = {
     "coffee-pull-v3": _mug,
     "coffee-push-v3": _mug,
     "disassemble-v3": disassemble,
+    "door-open-v3": door_open,
     "hammer-v3": hammer,
     "hand-insert-v3": hand_insert,
+    "handle-pull-side-v3": handle_pull_side,
     "peg-insert-side-v3": peg_insert,
+    "peg-unplug-side-v3": peg_unplug,
+    "pick-out-of-hole-v3": pick_out,
+    "pick-place-v3": push,
+    "pick-place-wall-v3": wall,
+    "push-v3": push,
+    "push-wall-v3": wall,
     "push-back-v3": push,
+    "shelf-place-v3": shelf_place,
+    "stick-push-v3": stick_push,
+    "sweep-v3": push,
     "sweep-into-v3": push,
 }
