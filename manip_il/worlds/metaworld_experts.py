@@ -39,7 +39,9 @@ def reach(seen: F64, target: F64, effort: float, gain: float = GAIN) -> F64:
     return np.clip(np.append(gain * error, effort), -1.0, 1.0)
 
 
-def grasp(seen: F64, at: F64, carried: F64, near: float = 0.02, deep: float = 0.02) -> F64:
+def grasp(
+    seen: F64, at: F64, carried: F64, near: float = 0.02, deep: float = 0.02, gap: float = GAP
+) -> F64:
     """Return the action that grasps an object, or carries it if it is held.
 
     A hand that is not around the object opens and goes above it, however it got there.
@@ -50,15 +52,16 @@ def grasp(seen: F64, at: F64, carried: F64, near: float = 0.02, deep: float = 0.
         carried: Target of the hand if the object is held, (3,) [m].
         near: Most error of the hand in the plane [m].
         deep: Most error of the hand in height [m].
+        gap: Opening above which nothing is held.
     """
     opening, closing = seen[3], seen[21] - seen[3]
     moved = seen[4:7] - seen[22:25]
     error = seen[:3] - at
     apart = float(np.hypot(*error[:2]))
     if apart < near and abs(error[2]) < deep:
-        held = opening < GAP and closing < 0.01
+        held = opening < gap and closing < 0.01
         return reach(seen, carried if held else at, CLOSED)
-    clear = np.clip(max(apart / near - 0.8, 5 * (GAP - opening)), 0, 1)
+    clear = np.clip(max(apart / near - 0.8, 5 * (gap - opening)), 0, 1)
     return reach(seen, at + LEAD * moved + CLEARANCE * clear * UP, OPEN)
 
 
@@ -179,7 +182,8 @@ def pick_out(seen: F64) -> F64:
 
 def peg_unplug(seen: F64) -> F64:
     """Pull the peg out."""
-    return grasp(seen, seen[4:7] + (-0.02, 0, 0.02), seen[:3] + (0.1, 0, 0))
+    peg, goal = seen[4:7], seen[36:39]
+    return grasp(seen, peg + (-0.03, 0, 0.015), seen[:3] + goal - peg, 0.025, gap=0.95)
 
 
 def stick_push(seen: F64) -> F64:
@@ -191,6 +195,17 @@ def stick_push(seen: F64) -> F64:
     else:
         left = goal - bottle + (0.05, 0, 0)
     return grasp(seen, stick + (0.015, 0, 0.03), seen[:3] + left)
+
+
+def stick_pull(seen: F64) -> F64:
+    """Put the stick through the bottle's handle and pull."""
+    stick, handle, goal = seen[4:7], seen[11:14], seen[36:39]
+    left = handle - stick
+    if left[0] < 0.03 and max(abs(left[1:])) < 0.04:
+        left[:2] = (goal - handle)[:2]
+    elif max(abs(left[1:])) > 0.015:
+        left[0] = 0
+    return grasp(seen, stick + (-0.015, 0, 0.035), seen[:3] + left)
 
 
 def handle_pull_side(seen: F64) -> F64:
@@ -231,6 +246,7 @@ EXPERTS: dict[str, Callable[[F64], F64]] = {
     "push-wall-v3": wall,
     "push-back-v3": push,
     "shelf-place-v3": shelf_place,
+    "stick-pull-v3": stick_pull,
     "stick-push-v3": stick_push,
     "sweep-v3": push,
     "sweep-into-v3": push,
