@@ -103,7 +103,17 @@ def assembly(seen: F64) -> F64:
 
 def disassemble(seen: F64) -> F64:
     """Lift the wrench off the peg."""
-    at = seen[4:7] + 0.02 * axis(*seen[7:11], 1) + 0.04 * UP
+    hand, wrench, along = seen[:3], seen[4:7], axis(*seen[7:11], 1)
+    if abs(along[0]) < 0.5:  # between the fingers it would lie lengthwise, so it is turned first
+        sign = 1.0 if along[0] * along[1] >= 0 else -1.0
+        aside = sign * np.array([-along[1], along[0], 0.0])
+        beside = wrench - 0.06 * aside + 0.02 * UP
+        error = hand - beside
+        if hand[2] < beside[2] + 0.03 and abs(error @ along) < 0.04 and error @ aside > -0.02:
+            return reach(seen, beside + 0.1 * aside, OPEN)
+        clear = np.clip(np.hypot(*error[:2]) / 0.02 - 0.8, 0, 1)
+        return reach(seen, beside + CLEARANCE * clear * UP, OPEN)
+    at = wrench + 0.02 * along + 0.04 * UP
     return grasp(seen, at, seen[:3] + 0.1 * UP, 0.02, 0.025)
 
 
@@ -183,7 +193,8 @@ def pick_out(seen: F64) -> F64:
 def peg_unplug(seen: F64) -> F64:
     """Pull the peg out."""
     peg, goal = seen[4:7], seen[36:39]
-    return grasp(seen, peg + (-0.03, 0, 0.015), seen[:3] + goal - peg, 0.025, gap=0.95)
+    pulled = seen[:3] + np.clip(goal - peg, -0.02, 0.02)  # slowly, not to slip
+    return grasp(seen, peg + (-0.035, 0, 0.015), pulled, 0.03, gap=1.01)
 
 
 def stick_push(seen: F64) -> F64:
