@@ -104,12 +104,12 @@ def assembly(seen: F64) -> F64:
 def disassemble(seen: F64) -> F64:
     """Lift the wrench off the peg."""
     hand, wrench, along = seen[:3], seen[4:7], axis(*seen[7:11], 1)
-    if abs(along[0]) < 0.5:  # between the fingers it would lie lengthwise, so it is turned first
+    if abs(along[0]) < 0.4:  # between the fingers it would lie lengthwise, so it is turned first
         sign = 1.0 if along[0] * along[1] >= 0 else -1.0
         aside = sign * np.array([-along[1], along[0], 0.0])
-        beside = wrench - 0.06 * aside + 0.02 * UP
+        beside = wrench - 0.06 * aside + 0.04 * UP
         error = hand - beside
-        if hand[2] < beside[2] + 0.03 and abs(error @ along) < 0.04 and error @ aside > -0.02:
+        if hand[2] < beside[2] + 0.022 and abs(error @ along) < 0.04 and error @ aside > -0.02:
             return reach(seen, beside + 0.1 * aside, OPEN)
         clear = np.clip(np.hypot(*error[:2]) / 0.02 - 0.8, 0, 1)
         return reach(seen, beside + CLEARANCE * clear * UP, OPEN)
@@ -134,7 +134,15 @@ def hammer(seen: F64) -> F64:
 
 def hand_insert(seen: F64) -> F64:
     """Carry the block down into the hole."""
-    block, goal = seen[4:7], seen[36:39]
+    hand, block, goal = seen[:3], seen[4:7], seen[36:39]
+    if block[2] < 0.04 and block[1] > 0.86:  # by the hole's wall, no finger fits: drag it
+        top = block + 0.06 * UP
+        error = hand - top
+        apart = np.hypot(*error[:2])
+        if apart < 0.02 and error[2] < 0.02:
+            return reach(seen, hand + (*(goal - block)[:2], -0.1), CLOSED)
+        clear = np.clip(apart / 0.02 - 0.8, 0, 1)
+        return reach(seen, top + (0, 0, CLEARANCE * clear - 0.02), CLOSED)
     return grasp(seen, block + 0.04 * UP, over(seen, block, goal - 0.03 * UP, 0.1), 0.02, 0.03)
 
 
