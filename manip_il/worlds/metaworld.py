@@ -1,4 +1,5 @@
-"""Meta-World's fifty tasks as LeRobot's environment makes them, with the scripts of the package.
+"""Meta-World's fifty tasks as LeRobot's environment makes them, labelled by the package's scripts
+and, where these fail, by `metaworld_experts`.
 
 Yu et al. 2019, "Meta-World: A benchmark and evaluation for multi-task and meta reinforcement
 learning". What is trained here is measured by `lerobot-eval --env.type=metaworld`.
@@ -20,12 +21,12 @@ from numpy.typing import NDArray
 
 from manip_il.errors import ManipError
 from manip_il.mdp import F64
+from manip_il.sim.config import CameraConfig
 from manip_il.worlds.gym.drawing import painted
 from manip_il.worlds.gym.environment import GymKind
 from manip_il.worlds.gym.restoring import simulation
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 from manip_il.worlds.metaworld_experts import EXPERTS
-from manip_il.sim.config import CameraConfig
 
 INSTALL = "pip install --no-deps metaworld==3.0.0"
 SEED = 42  # of the task that LeRobot's environment takes
@@ -110,7 +111,8 @@ def _package(name: str) -> Any:
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
-        raise ManipError(f"metaworld needs {error.name}, which is not installed: {INSTALL}") from error
+        message = f"metaworld needs {error.name}, which is not installed: {INSTALL}"
+        raise ManipError(message) from error
 
 
 class MetaworldKind(GymKind):
