@@ -75,12 +75,12 @@ def is_held(world: World, name: str) -> bool:
         return False  # too far away; grasps need not be computed
     if world.hull(name) is None:
         g = grasp_of(world, name)
-        is_between = is_inside(g.offset, (g.length / 2 + x, y, g.half + z))
+        offset, box = g.offset, (g.length / 2 + x, y, g.half + z)
     else:  # a mesh may be at any rotation in the hand
-        across, along, ahead = (world.at(name) - world.ee.position).dot(world.ee.rotation).tolist()
-        along -= world.gripper.middle(world.opening)
-        is_between = is_inside((across, along, ahead), (half + x, y, half + z))
-    return is_between and world.touched(name)
+        offset = (world.at(name) - world.ee.position).dot(world.ee.rotation).tolist()
+        offset[1] -= world.gripper.middle(world.opening)
+        box = (half + x, y, half + z)
+    return is_inside(offset, box) and world.touched(name)
 
 
 def at_grasp(world: World, name: str) -> bool:
@@ -93,8 +93,8 @@ def at_grasp(world: World, name: str) -> bool:
     if world.hull(name) is not None:
         # A mesh's sides may be round: fingers that close too high slip off.
         deep = max(LEAST_DEEP, DEEP_SHARE * lie_of(world, name).tall)
-        over = float(world.ee.position[2]) - g.at[2]
-        if world.opening < EMPTY * g.width or over > (deep if g.open_enough else 2 * deep):
+        deep = deep if g.open_enough else 2 * deep
+        if world.opening < EMPTY * g.width or world.ee.position[2] - g.at[2] > deep:
             return False
     return is_inside(g.offset, box) and g.angle < AT_GRASP_ANGLE and g.settled
 
@@ -104,9 +104,8 @@ def rise_first(at: F64, to: Sequence[float] | F64) -> F64:
 
     It is straight up if the point is far below the other.
     """
-    (x, y, z), (to_x, to_y, to_z) = at.tolist(), to
-    sideways = share(1.0 - (to_z - z) / RISE_FIRST)
-    return np.array([x + sideways * (to_x - x), y + sideways * (to_y - y), to_z])
+    sideways = share(1.0 - (to[2] - at[2]) / RISE_FIRST)
+    return np.append((at + sideways * (to - at))[:2], to[2])
 
 
 def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> Target:
@@ -208,7 +207,7 @@ def grasp_rungs(
 
     def near(world: World) -> bool:
         g = grasp_of(world, which(world))
-        return (g.height if g.settled else max(g.height, g.half + CLEAR)) < g.half + HOVER
+        return g.height < g.half + HOVER
 
     def approaching(world: World) -> Target:
         return approach(world, which(world), hover)
@@ -225,10 +224,7 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
     """Return the ladder that grasps an object and carries it to the goal."""
 
     def at_goal(world: World) -> bool:
-        return (
-            is_held(world, name)
-            and math.dist(world.at(name).tolist(), world.goal.tolist()) < AT_GOAL
-        )
+        return is_held(world, name) and math.dist(world.at(name), world.goal) < AT_GOAL
 
     def to_goal(world: World) -> Target:
         return carry(world, name, world.goal)

@@ -89,8 +89,8 @@ def add_furniture(spec: mujoco.MjSpec, name: str) -> Any:
 
 def add_part(
     body: Any, name: str, half: Sequence[float], at: Sequence[float], colour: tuple[float, ...]
-) -> None:
-    """Add a solid box to a body.
+) -> Any:
+    """Add a solid box to a body and return its geom.
 
     Args:
         body: The body to add it to.
@@ -99,7 +99,7 @@ def add_part(
         at: Its middle in the body's frame, (3,) [m].
         colour: Red, green and blue, 0 to 1.
     """
-    body.add_geom(
+    return body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=list(half),

@@ -19,10 +19,10 @@ from manip_il.tasks.ladder import is_held, pick_progress, pick_rungs
 from manip_il.tasks.objects import CUBE_MASS, RED, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import (
-    FEW_DRAWS,
     LIFT,
     LIFT_HEIGHT,
     UPRIGHT,
+    draw_few,
     draw_goal,
     draw_lying,
     draw_until,
@@ -89,7 +89,7 @@ class PickPlace(Task):
 
     def error(self, world: World) -> float:
         """Return the distance of the object's centre from the goal [m]."""
-        return math.dist(world.at(OBJECT).tolist(), world.goal.tolist())
+        return math.dist(world.at(OBJECT), world.goal)
 
     def unsound(self, world: World) -> str:
         """Return why there is no sound label, or "" if there is one.
@@ -122,8 +122,7 @@ class Lift(PickPlace):
 
         def draw_both() -> dict[str, tuple[F64, F64]]:
             at, turn = draw_lying(rng, world, OBJECT)
-            goals = (at + [0.0, 0.0, rng.uniform(low, high)] for _ in range(FEW_DRAWS))
-            goal = next((goal for goal in goals if world.reach.has(goal)), None)
+            goal = draw_few(lambda: at + [0.0, 0.0, rng.uniform(low, high)], world.reach.has)
             return {} if goal is None else {OBJECT: (at, turn), GOAL: (goal, UPRIGHT)}
 
         return Start(draw_until(draw_both, bool, world, "the goal"))

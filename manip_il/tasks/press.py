@@ -11,7 +11,7 @@ from manip_il.sim.world import World
 from manip_il.tasks.ladder import CLOSED, LiftProfile, nearness, rise_first
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_part
 from manip_il.tasks.reach import observe_hand
-from manip_il.tasks.starts import draw_resting_place, draw_yaw
+from manip_il.tasks.starts import draw_resting, draw_yaw
 
 BUTTON, CAP = "button", "cap"
 TRAVEL = 0.015  # travel of the cap [m]
@@ -75,7 +75,7 @@ class Press(Task):
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw where the button stands, not under the hand, and its yaw."""
-        at = draw_resting_place(rng, world, BUTTON, TOP)
+        at = draw_resting(rng, world, BUTTON, height=TOP)
         return Start({BUTTON: (np.append(at[:2], 0.0), draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:

@@ -45,7 +45,7 @@ class ReachGoal(Task):
 
     def error(self, world: World) -> float:
         """Return the distance of `ee` from the goal [m]."""
-        return math.dist(world.ee.position.tolist(), world.goal.tolist())
+        return math.dist(world.ee.position, world.goal)
 
     def progress(self, world: World) -> float:
         """Return progress by the distance left."""
