@@ -22,9 +22,7 @@ from manip_il.tasks.bins import (
 )
 from manip_il.tasks.grasp import once_per_state
 from manip_il.tasks.ladder import carry_progress, grasp_progress, grasp_rungs, is_held
-from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
-from manip_il.tasks.pick_place import observe_object
-from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube, observe_hand, observe_object
 from manip_il.tasks.starts import UPRIGHT, draw_few, draw_resting, draw_until, draw_yaw
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW, "white": (0.92, 0.92, 0.90)}
@@ -126,10 +124,7 @@ class ClearTable(Task):
         return {
             **observe_hand(world),
             BOX: world.at(BOX),
-            **{
-                key.replace(name, "next", 1): value
-                for key, value in observe_object(world, name).items()
-            },
+            **observe_object(world, name, "next"),
             "place_from_next": _to(world) - world.at(name),
             **{one: world.at(one) for one in COLOURS},
             **{f"{one}.in_box": float(_inside(world, one)) for one in COLOURS},

@@ -1,5 +1,8 @@
-"""Free objects, furniture and goal markers that tasks put on the table."""
+"""Free objects, furniture and goal markers that tasks put on the table, and what is observed of
+objects and hand.
+"""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,8 +11,10 @@ import numpy as np
 
 from manip_il.sim.mesh import Mesh
 from manip_il.sim.shape import ANY, MESH, contact
+from manip_il.sim.task import Observed
 from manip_il.sim.variation import GEOMS
-from manip_il.sim.world import GOAL
+from manip_il.sim.world import GOAL, World
+from manip_il.tasks.grasp import is_cube, lie_of
 
 CUBE_HALF = 0.025  # [m]
 CUBE_MASS = 0.1  # [kg]
@@ -126,3 +131,50 @@ def add_goal(spec: mujoco.MjSpec, *, flat: bool = False) -> None:
     body.add_geom(
         name=GOAL, type=shape, size=size, material=material.name, contype=0, conaffinity=0, mass=0
     )
+
+
+def observe_hand(world: World) -> Observed:
+    """Return the hand's position and its y and z axes.
+
+    They are the first entries of every `environment_state`.
+    """
+    ee = world.ee
+    return {"ee": ee.position, "ee.axis_y": ee.rotation[:, 1], "ee.axis_z": ee.rotation[:, 2]}
+
+
+def observe_object(world: World, name: str, known_as: str = "") -> Observed:
+    """Return an object's pose and lengths, and the vector to it from the hand.
+
+    The pose is its position, its yaw modulo its symmetry, and its tilt.
+
+    Args:
+        world: The world to look at.
+        name: The object's name.
+        known_as: The name of the object in what is returned, by default its own.
+    """
+    known_as = known_as or name
+    position, lie = world.at(name), lie_of(world, name)
+    if not world.scene.draws_shape and is_cube(world, name):
+        seen: Observed = {
+            "cos4yaw": math.cos(4 * lie.yaw),
+            "sin4yaw": math.sin(4 * lie.yaw),
+            "tilt": lie.tilt,
+            "width": world.extents(name)[0],
+        }
+    else:  # numbers of the narrowest grasp change continuously as the object turns
+        yaw, width, length, centre = min(lie.grasps, key=lambda grasp: grasp.width)
+        seen = {
+            "folds": float(lie.folds),
+            "cosyaw": math.cos(lie.folds * yaw),
+            "sinyaw": math.sin(lie.folds * yaw),
+            "tilt": lie.tilt,
+            "width": width,
+            "length": length,
+            "height": lie.tall,
+            **({"grasp": np.array(centre)} if world.hull(name) else {}),
+        }
+    return {
+        known_as: position,
+        **{f"{known_as}.{key}": value for key, value in seen.items()},
+        f"{known_as}_from_ee": position - world.ee.position,
+    }

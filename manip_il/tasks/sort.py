@@ -30,9 +30,15 @@ from manip_il.tasks.ladder import (
     is_held,
     nearness,
 )
-from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, add_furniture
-from manip_il.tasks.pick_place import observe_object
-from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.objects import (
+    BLUE,
+    RED,
+    YELLOW,
+    add_cube,
+    add_furniture,
+    observe_hand,
+    observe_object,
+)
 from manip_il.tasks.starts import FROM_HAND, UPRIGHT, draw_until, draw_yaw, resting_height
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW}
@@ -111,12 +117,12 @@ def _put_back(world: World) -> Target:
     low = z - lie_of(world, name).tall / 2
     centre, row = world.robot.workspace.centre[1], world.at(BINS[name])[1]
     inwards = FROM_BINS - abs(y - row)  # distance to move until it is off the bins
-    way, opening = [0.0, 0.0, -max(0.0, low)], CLOSED if low > 0.008 else world.gripper.most
+    sideways, up = 0.0, -max(0.0, low)
     if inwards > 0:
-        missing = WALL + _HIGH - low
-        sideways = share(1.0 - missing / 0.03) * math.copysign(inwards + 0.02, centre - row)
-        way, opening = [0.0, sideways, missing], CLOSED
-    return Target(world.ee.position + way, hand_down(0.0), opening)
+        up = WALL + _HIGH - low
+        sideways = share(1.0 - up / 0.03) * math.copysign(inwards + 0.02, centre - row)
+    opening = CLOSED if inwards > 0 or low > 0.008 else world.gripper.most
+    return Target(world.ee.position + [0.0, sideways, up], hand_down(0.0), opening)
 
 
 def _free_yaw(world: World) -> float | None:
@@ -140,7 +146,7 @@ def _approach(world: World, name: str, hover: float) -> Target:
         return target
     ee, g = world.ee, grasp_of(world, name)
     hand = angle_ahead(ee.rotation)
-    yaws = (yaw for yaw, _, _, _ in lie_of(world, name).grasps)
+    yaws = (grasp.yaw for grasp in lie_of(world, name).grasps)
     yaw = min(yaws, key=lambda yaw: (round(abs(math.sin(yaw - free)), 6), abs(yaw - hand)))
     low = g.at[2] + g.half + CLEAR if angle_from_down(ee.rotation, yaw) > TURNED else 0.0
     return Target(
@@ -153,11 +159,11 @@ def _middle(world: World) -> tuple[float, float]:
     cube.
     """
     x, y = world.robot.workspace.centre
-    line = [(across, height) for across in (-0.2, -0.1, 0.0, 0.1, 0.2) for height in (0.03, 0.15)]
+    line = [(x, y + across, z) for across in (-0.2, -0.1, 0.0, 0.1, 0.2) for z in (0.03, 0.15)]
     shifts = [
         shift
         for shift in np.arange(-0.35, 0.35, 0.025).tolist()
-        if all(world.reach.has((x + shift, y + across, height)) for across, height in line)
+        if world.reach.has_each(np.array(line) + [shift, 0.0, 0.0]).all()
     ]
     middle = (shifts[0] + shifts[-1]) / 2 if shifts else 0.0
     return x + min(SHIFT, max(-SHIFT, middle)), y
@@ -237,12 +243,8 @@ class Sort(Task):
 
         def fits(at: F64) -> bool:
             others = [poses[name][0] for name in COLOURS if name in poses]
-            from_hand = math.dist(at[:2], hand) > FROM_HAND
-            return (
-                from_hand
-                and world.reach.has(at)
-                and all(math.dist(at, other) > APART for other in others)
-            )
+            apart = all(math.dist(at, other) > APART for other in others)
+            return apart and math.dist(at[:2], hand) > FROM_HAND and world.reach.has(at)
 
         for name in COLOURS:
             at = draw_until(partial(_draw_place, rng, world, name, side), fits, world, name)
@@ -258,10 +260,7 @@ class Sort(Task):
         return {
             **observe_hand(world),
             **{f"{ASKED}.{other}": float(other == name) for other in COLOURS},
-            **{
-                key.replace(name, "cube", 1): value
-                for key, value in observe_object(world, name).items()
-            },
+            **observe_object(world, name, "cube"),
             "bin_from_cube": world.at(BINS[name]) - world.at(name),
             "place_from_cube": _to(world) - world.at(name),
             **{other: world.at(other) for other in COLOURS},
@@ -284,7 +283,7 @@ class Sort(Task):
         """
         name = asked(world)
         if _is_sorted(world, name):
-            return 1.0 if not _wrong(world) else 0.95
+            return 0.95 if _wrong(world) else 1.0
         if is_held(world, name):
             along, across, up = (_place(world) - world.at(name)).tolist()
             lift = OVER_WALL.over(max(0.0, math.hypot(along, across) - INSIDE[0]))

@@ -26,7 +26,7 @@ _BOX, _SPHERE, _CAPSULE = (
 )
 _HALF = np.sqrt(0.5)
 # turn x, y or z up
-_UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.0]), UPRIGHT)
+UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.0]), UPRIGHT)
 
 
 def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, F64]:
@@ -57,7 +57,7 @@ def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, 
         lengths = world.extents(name)
         sides = _sides(world.kind(name), lengths)
         up = sides[int(rng.integers(len(sides)))]
-        height, turn = lengths[up] / 2, _UPWARDS[up]
+        height, turn = lengths[up] / 2, UPWARDS[up]
     at = draw_resting(rng, world, name, height=height)
     return at, product(draw_yaw(rng, np.pi), turn)
 

@@ -6,13 +6,14 @@ names its task: what these store is a `str`, which is a name.
 """
 
 import hashlib
-import importlib.util
 import inspect
 import sys
+from collections.abc import Callable
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.machinery import SourceFileLoader
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 from manip_il import checks
 from manip_il.errors import OWN, UnknownName, UsageError
@@ -82,7 +83,7 @@ def is_task(name: str) -> bool:
     The task's code is not run.
     """
     base = name.partition(":")[0]
-    return base in TASKS or _entry_point(base) is not None
+    return base in TASKS or bool(entry_points(group=GROUP, name=base))
 
 
 def source_hash(task: Task) -> str:
@@ -94,20 +95,10 @@ def source_hash(task: Task) -> str:
 def _named(name: str) -> Task:
     if name in TASKS:
         return TASKS[name]
-    entry = _entry_point(name)
-    if entry is None:
+    found = tuple(entry_points(group=GROUP, name=name))
+    if not found:
         raise UnknownName("task", name, (*TASKS, "the path of a Python file"))
-    try:
-        cls = entry.load()
-    except Exception as error:
-        raise UsageError(
-            f"{name} of {entry.value} cannot be imported: {checks.one_line(error)}"
-        ) from error
-    return _made(f"task {name} of {entry.value}", cls)
-
-
-def _entry_point(name: str) -> EntryPoint | None:
-    return next(iter(entry_points(group=GROUP, name=name)), None)
+    return _made(f"task {name} of {found[0].value}", lambda: found[0].load()())
 
 
 @cache
@@ -116,22 +107,23 @@ def _of_file(path: Path) -> Task:
     if not path.is_file():
         raise UsageError(f"{path} does not exist; expected a Python file with a task of your own")
     name = f"{OWN}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None  # because the path ends in `.py`
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look it up there
+    module = sys.modules[name] = ModuleType(name)  # dataclasses look it up there
+    module.__file__ = str(path)
     try:
-        spec.loader.exec_module(module)
+        SourceFileLoader(name, str(path)).exec_module(module)
     except Exception as error:
         del sys.modules[name]
         raise UsageError(
             f"{path} cannot be run: {type(error).__name__}: {checks.one_line(error)}"
         ) from error
-    own = [one for one in vars(module).values() if inspect.isclass(one) and one.__module__ == name]
-    tasks = [cls for cls in own if issubclass(cls, Task) and not cls.__name__.startswith("_")]
+    tasks = [
+        value
+        for key, value in vars(module).items()
+        if inspect.isclass(value) and issubclass(value, Task) and value.__module__ == name
+        if not key.startswith("_")
+    ]
     if len(tasks) != 1:
-        found = ", ".join(one.__name__ for one in tasks) or "none"
+        found = ", ".join(cls.__name__ for cls in tasks) or "none"
         raise UsageError(
             f"tasks in {path}: {found}; expected one subclass of manip_il.task.Task"
             " (docs/new-task.md)"
@@ -144,9 +136,9 @@ def _of_file(path: Path) -> Task:
     return task
 
 
-def _made(what: str, cls: Any) -> Task:
+def _made(what: str, make: Callable[[], Task]) -> Task:
     try:
-        task = cls()
+        task = make()
         checks.name("its name", task.name)
         _ = task.instruction, task.rungs  # both must be there
     except Exception as error:

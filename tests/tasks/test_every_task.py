@@ -3,13 +3,11 @@ fingerprint.
 """
 
 import copy
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -83,6 +81,7 @@ def test_the_last_rung_holds_everywhere(robot: str, task: str):
             turn = rng.normal(size=4)
             world.place(name, rng.uniform(-1, 1, 3), turn / np.linalg.norm(turn))
         world.update()
+        assert 0 <= TASKS[task].progress(world) <= 1
         assert TASKS[task].rungs[-1].holds(world)
         for rung in TASKS[task].rungs:
             target = rung.target(world)
@@ -150,17 +149,6 @@ def test_progress_never_falls_along_the_experts_path_and_ends_at_one(
 
 
 @every_scene
-def test_progress_is_a_share_wherever_the_arm_gets_to(robot: str, task: str):
-    env = make_env(robot, task)
-    for seed in SEEDS:
-        env.start(seed)
-        rng = np.random.default_rng(seed)
-        for _ in range(30):
-            env.advance(env.scene.actions.random_near(env.observe().state, rng))
-            assert 0 <= TASKS[task].progress(env.world) <= 1
-
-
-@every_scene
 def test_what_is_solved_is_at_the_goal_within_the_tolerance_and_what_is_not_is_not(
     robot: str, task: str
 ):
@@ -188,22 +176,14 @@ def test_what_is_solved_is_at_the_goal_within_the_tolerance_and_what_is_not_is_n
         assert fresh.progress < env.progress
 
 
-# Of one joint's motor, of one thing's weight, of the light: whatever it is, it is another model.
-CHANGES: dict[str, Callable[[mujoco.MjModel], None]] = {
-    "a gain": lambda model: model.actuator_gainprm.__imul__(1.01),
-    "a weight": lambda model: model.body_mass.__imul__(1.01),
-    "a friction": lambda model: model.geom_friction.__imul__(1.01),
-    "a place": lambda model: model.body_pos.__iadd__(1e-6),
-    "the step": lambda model: setattr(model.opt, "timestep", 0.0021),
-}
-
-
-@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize(
+    "change", ["actuator_gainprm", "body_mass", "geom_friction", "body_pos", "qpos0"]
+)
 def test_the_fingerprint_changes_with_the_model(change: str, monkeypatch):
     config, scene = make_config(), scene_of("panda", "pick_place")
     before = env_fingerprint(config)
     model = copy.copy(scene.model)
-    CHANGES[change](model)
+    getattr(model, change)[...] += 1e-6
     monkeypatch.setattr(world, "config_scene", lambda _: replace(scene, model=model))
     after = world.WORLD.fingerprint(config)
     assert {key for key in before if before[key] != after[key]} == {"model_sha256"}

@@ -4,6 +4,7 @@ it.
 
 import pickle
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -24,6 +25,8 @@ from manip_il.tasks import table
 from manip_il.tasks.table import get_task
 from manip_il.worlds.ladder.world import scene_of
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config, world_of
+
+from ..meshes import write_mesh
 
 PAGE = Path(__file__).parents[2] / "docs" / "new-task.md"
 TOUCH, RAISE = (block.split("```", 1)[0] for block in PAGE.read_text().split("```python\n")[1:])
@@ -79,6 +82,21 @@ def test_an_own_object_is_replaced_by_the_one_that_is_asked_for(tmp_path):
     }
     assert [one.object for one in asked.values()] == ["", "box:0.05", "sphere:0.05"]
     assert make_config("panda", str(tmp_path / "own.py"), object="cylinder:0.04x0.06") == asked[""]
+
+
+def test_a_node_gets_the_files_of_task_and_mesh(tmp_path):
+    (tmp_path / "own.py").write_text(CYLINDER)
+    mesh = write_mesh("wedge", tmp_path)
+    own = make_config("panda", str(tmp_path / "own.py"), object=f"mesh:{mesh}")
+    tasks, meshes = ({path.name: path.read_bytes()} for path in (tmp_path / "own.py", mesh))
+    job = RolloutJob(own, hold=0)
+    [here] = list(job.run([5]))
+    mesh.unlink()
+    away = replace(job, env=replace(own, object=Path(f"mesh:{tmp_path / 'away' / mesh.name}")))
+    answer = run_there(manip_il.__version__, away, (5,), None, tasks, meshes)
+    [(there, _)] = pickle.loads(zstandard.decompress(answer))
+    for name, column in here.without_pictures().columns.items():
+        np.testing.assert_array_equal(there.columns[name], column)
 
 
 def test_files_that_were_edited_since_they_were_read_are_refused(tmp_path, touch):
@@ -173,16 +191,6 @@ def test_a_policy_of_it_is_evaluated_by_its_path_without_a_warning(
     assert "differs" not in capsys.readouterr().err
 
 
-def test_a_node_gets_the_file(touch):
-    job = RolloutJob(make_config("panda", str(touch)), hold=0)
-    files, [here] = {"touch.py": touch.read_bytes()}, list(job.run([5]))
-    touch.unlink()
-    answer = run_there(manip_il.__version__, job, (5,), None, files, None)
-    [(there, _)] = pickle.loads(zstandard.decompress(answer))
-    for name, column in here.without_pictures().columns.items():
-        np.testing.assert_array_equal(there.columns[name], column)
-
-
 MISTAKES = {
     "is not Python": ("def (", "cannot be run: SyntaxError"),
     "lacks a function": (
@@ -209,17 +217,8 @@ def test_a_file_that_holds_no_task_is_one_line(case, tmp_path, capsys):
     content, says = MISTAKES[case]
     path = tmp_path / "own.py"
     path.write_text(content)
-    assert (
-        main(
-            [
-                "eval",
-                "--policy.type=expert",
-                f"--task.type={path}",
-                f"--output_dir={tmp_path / 'e'}",
-            ]
-        )
-        == 2
-    )
+    words = [f"--task.type={path}", f"--output_dir={tmp_path / 'e'}"]
+    assert main(["eval", "--policy.type=expert", *words]) == 2
     error = capsys.readouterr().err
     assert (error.count("\n"), says in error) == (1, True), error
 
