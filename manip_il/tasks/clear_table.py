@@ -22,7 +22,7 @@ from manip_il.tasks.bins import (
 )
 from manip_il.tasks.grasp import once_per_state
 from manip_il.tasks.ladder import carry_progress, grasp_progress, grasp_rungs, is_held
-from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube, observe_hand, observe_object
+from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, observe_hand, observe_object
 from manip_il.tasks.starts import UPRIGHT, draw_few, draw_resting, draw_until, draw_yaw
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW, "white": (0.92, 0.92, 0.90)}
@@ -90,7 +90,7 @@ class ClearTable(Task):
         """Add the cubes and the box."""
         for name, colour in COLOURS.items():
             add_cube(spec, name, HALF, 0.05, colour)
-        add_bin(spec, BOX, INSIDE, WOOD)
+        add_bin(spec, BOX, INSIDE)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw the box's side, and the cubes on the table, apart and at any yaw."""
@@ -126,8 +126,8 @@ class ClearTable(Task):
             BOX: world.at(BOX),
             **observe_object(world, name, "next"),
             "place_from_next": _to(world) - world.at(name),
-            **{one: world.at(one) for one in COLOURS},
-            **{f"{one}.in_box": float(_inside(world, one)) for one in COLOURS},
+            **{cube: world.at(cube) for cube in COLOURS},
+            **{f"{cube}.in_box": float(_inside(world, cube)) for cube in COLOURS},
         }
 
     def error(self, world: World) -> float:

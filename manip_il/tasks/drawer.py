@@ -25,10 +25,10 @@ from manip_il.tasks.ladder import (
 )
 from manip_il.tasks.objects import (
     GREY,
-    WOOD,
     add_cube,
     add_furniture,
     add_part,
+    add_sides,
     observe_hand,
     observe_object,
 )
@@ -92,36 +92,25 @@ def add_cabinet(spec: mujoco.MjSpec) -> None:
     deep, wide = length + 2 * THIN, width + 3 * THIN  # half the cabinet's depth and width
     back = front + 2 * deep
     whole = wide + 2 * THIN
-    for side, y in (("left", wide + THIN), ("right", -(wide + THIN))):
-        add_part(
-            cabinet, f"cabinet {side}", (deep, THIN, ROOF / 2), (front + deep, y, ROOF / 2), WOOD
-        )
-    add_part(cabinet, "cabinet back", (THIN, whole, ROOF / 2), (back + THIN, 0, ROOF / 2), WOOD)
-    add_part(
-        cabinet,
-        "cabinet top",
-        (deep + THIN, whole, THIN),
-        (front + deep + THIN, 0, ROOF + THIN),
-        WOOD,
-    )
+    add_sides(cabinet, "cabinet", (deep, THIN, ROOF / 2), (front + deep, wide + THIN, ROOF / 2))
+    add_part(cabinet, "cabinet back", (THIN, whole, ROOF / 2), (back + THIN, 0, ROOF / 2))
+    top = (front + deep + THIN, 0, ROOF + THIN)
+    add_part(cabinet, "cabinet top", (deep + THIN, whole, THIN), top)
     tray = cabinet.add_body(name=TRAY)
     tray.add_joint(
         name=TRAY, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-1, 0, 0], limited=True, range=[0, OPEN],
         damping=[5.0, 0, 0], frictionloss=0.5, armature=0.05,
     )  # fmt: skip
     middle = front + length
-    add_part(tray, "drawer floor", (length, width, THIN), (middle, 0, FLOOR - THIN), WOOD)
-    for side, y in (("left", width + THIN), ("right", -(width + THIN))):
-        add_part(tray, f"drawer {side}", (length, THIN, WALL / 2), (middle, y, WALL / 2), WOOD)
+    add_part(tray, "drawer floor", (length, width, THIN), (middle, 0, FLOOR - THIN))
+    add_sides(tray, "drawer", (length, THIN, WALL / 2), (middle, width + THIN, WALL / 2))
     # so high that nothing gets behind it
     back_z, back_half = (ROOF - THIN + FLOOR) / 2, (ROOF - THIN - FLOOR) / 2
-    add_part(
-        tray, "drawer back", (THIN, width, back_half), (front + 2 * length + THIN, 0, back_z), WOOD
-    )
-    add_part(tray, "drawer front", (THIN, whole, PANEL / 2), (GAP + THIN, 0, PANEL / 2), WOOD)
+    back = (front + 2 * length + THIN, 0, back_z)
+    add_part(tray, "drawer back", (THIN, width, back_half), back)
+    add_part(tray, "drawer front", (THIN, whole, PANEL / 2), (GAP + THIN, 0, PANEL / 2))
     add_part(tray, BAR, (BAR_HALF, BAR_LENGTH, BAR_HALF), (0, 0, BAR_Z), GREY)
-    for side, y in (("left", BAR_LENGTH), ("right", -BAR_LENGTH)):
-        add_part(tray, f"{BAR} {side}", (GAP / 2, BAR_HALF, BAR_HALF), (GAP / 2, y, BAR_Z), GREY)
+    add_sides(tray, BAR, (GAP / 2, BAR_HALF, BAR_HALF), (GAP / 2, BAR_LENGTH, BAR_Z), GREY)
     spec.add_exclude(bodyname1=CABINET, bodyname2=TRAY)
 
 

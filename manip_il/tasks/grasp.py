@@ -184,7 +184,7 @@ def grasp_of(world: World, name: str) -> Grasp:
     way, radius = (at_x - ee_x, at_y - ee_y), FUNNEL_RADIUS
     crowding = _crowding(yaw, gripper.most, neighbours)
     if gripper.lopsided:
-        way, radius = _beside_jaw(*way, yaw, -dz < half), BY_JAW
+        way, radius = _beside_jaw(*way, yaw, around=-dz < half), BY_JAW
         crowding = 1.0
     room = max(0.0, gripper.most - width)  # clearance of the open gripper [m]
     free = min(ANGLE_FREE, TIGHT * room / width)

@@ -106,10 +106,6 @@ def _bring(world: World) -> Target:
     return move(world, motion, missing, sideways_at, exact=motion.error < EXACT)
 
 
-def _insert_or_stay(world: World) -> Target:
-    return _bring(world) if holds_peg(world) else Target(*world.ee, CLOSED)
-
-
 @dataclass(frozen=True)
 class Insert(Task):
     """Put a peg into a hole that it fits.
@@ -126,7 +122,11 @@ class Insert(Task):
     objects = (PEG,)
     grasped = (PEG,)
     rungs = (
-        Rung("inserted", is_inserted, _insert_or_stay),
+        Rung(
+            "inserted",
+            is_inserted,
+            lambda w: _bring(w) if holds_peg(w) else Target(*w.ee, CLOSED),
+        ),
         Rung("insert", lambda w: hangs(w) and _lift(w) < DEPTH, _bring),
         Rung("carry", hangs, _bring),
         *PEG_RUNGS,
@@ -161,7 +161,7 @@ class Insert(Task):
         peg = draw_until(lambda: draw_resting(rng, world, PEG, height=height / 2), fits, world, PEG)
         turn = draw_yaw(rng, np.pi)
         if lies:
-            turn = product(turn, turn_ahead(_QUARTER))
+            turn = product(turn, _turn_ahead(_QUARTER))
         return Start({PEG: (peg, turn), HOLE: (hole, draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
@@ -203,8 +203,8 @@ class Insert(Task):
         return 0.6 + 0.3 * nearness(rest)
 
 
-def turn_ahead(angle: float) -> F64:
-    """Return the quaternion, wxyz (4,), of a turn about y, from z towards x [rad]."""
+def _turn_ahead(angle: float) -> F64:
+    """The quaternion, wxyz (4,), of a turn about y, from z towards x [rad]."""
     return np.array([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0])
 
 
@@ -222,6 +222,6 @@ def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
     up = height + CHAMFER / 2 - thick * math.cos(steep)
     half = (CHAMFER / math.sqrt(2), inner + WALL, thick)
     edge = add_part(hole, f"{name} edge", half, (c * out, s * out, up), GREY)
-    edge.quat = product(turn_left(yaw), turn_ahead(-steep))
+    edge.quat = product(turn_left(yaw), _turn_ahead(-steep))
     edge.friction = [SLIPPERY, 0.005, 0.0001]
     edge.priority = 1

@@ -37,7 +37,6 @@ FREED = 0.4  # share of that extra opening at which the object is free
 AT_GOAL = 0.01  # [m]
 CLOSED = 0.0  # commanded opening of a hand that grips [m]
 _HALFWAY = 0.2  # distance left at which half of a part's progress is made [m]
-_GRASPED = 0.5  # progress of an object that is held
 
 
 class LiftProfile(NamedTuple):
@@ -132,12 +131,12 @@ def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> 
 def close_on(world: World, name: str) -> Target:
     """Close the fingers on the object, where it is."""
     g = grasp_of(world, name)
-    at = np.array(g.at)
+    at, hand = np.array(g.at), hand_down(g.yaw)
     # the moving jaw pushes the object to the fixed one; the hand does not follow
     if world.gripper.lopsided:
-        across = np.array([math.sin(g.yaw), -math.cos(g.yaw), 0.0])
-        at += across * float(across @ (world.ee.position - at))
-    return Target(at, hand_down(g.yaw), CLOSED, lean=g.lean)
+        across = hand[:, 1].copy()
+        at += across * (across @ (world.ee.position - at))
+    return Target(at, hand, CLOSED, lean=g.lean)
 
 
 def carry(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) -> Target:
@@ -169,8 +168,9 @@ def let_go(world: World, name: str, height: float) -> Target:
     g, ee = grasp_of(world, name), world.ee
     beyond = min(RELEASE, world.gripper.most - g.width)
     free = world.opening > g.width + FREED * beyond and not world.touched(name)
-    up = world.at(name)[2] + height if free else ee.position[2]
-    at = np.array([*ee.position[:2], up])
+    at = ee.position.copy()
+    if free:
+        at[2] = world.at(name)[2] + height
     if world.gripper.lopsided:  # the fixed jaw must move off the object, too
         along = g.offset[1] + world.gripper.middle(g.width) - world.gripper.middle(g.width + beyond)
         at[:2] += along * ee.rotation[:2, 1]
@@ -248,7 +248,7 @@ def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.
         rise: The least height over the grasp [m].
     """
     g = grasp_of(world, name)
-    above = float(world.ee.position[2]) - g.at[2]
+    above = world.ee.position[2] - g.at[2]
     height = max(g.height, min(hover, g.funnel), rise)
     return nearness(g.off + abs(above - height) + height)
 
@@ -259,8 +259,8 @@ def pick_progress(world: World, name: str) -> float:
     It depends on the distance left on that path.
     """
     if is_held(world, name):
-        return _GRASPED + (1 - _GRASPED) * carry_progress(world, name, world.goal)
-    return 0.9 * _GRASPED * grasp_progress(world, name)
+        return 0.5 + 0.5 * carry_progress(world, name, world.goal)
+    return 0.45 * grasp_progress(world, name)
 
 
 def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) -> float:
@@ -274,7 +274,7 @@ def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = OVER_NO
         to: The target of the object's centre, (3,) [m].
         lift: The height of the object on its way there.
     """
-    x, y, z = (to - world.at(name)).tolist()
+    x, y, z = to - world.at(name)
     off = math.hypot(x, y)
     height = lift.over(off)
     return nearness(abs(z + height) + off + height)

@@ -318,12 +318,12 @@ def _let_stand(world: World) -> Target:
 
 def _falls(world: World) -> bool:
     """Whether the peg, between the fingers or just under their tips, neither stands nor lies."""
-    ee, lie, (at, rotation) = world.ee, lie_of(world, PEG), world.pose(PEG)
-    axis = rotation[:, 2]
-    along = float(axis @ (ee.position - at))
-    beside = ee.rotation.T @ (ee.position - at - along * axis)
+    peg, lie = world.pose(PEG), lie_of(world, PEG)
+    axis, way = peg.rotation[:, 2], world.ee.position - peg.position
+    along = float(axis @ way)
+    beside = world.ee.rotation.T @ (way - along * axis)
     between = abs(beside[1]) < world.opening / 2 and math.hypot(*beside) < BESIDE
-    moves = lie.tilt > 0.06 or at[2] - lie.tall / 2 > IN_AIR
+    moves = lie.tilt > 0.06 or peg.position[2] - lie.tall / 2 > IN_AIR
     return between and abs(along) <= LENGTH / 2 and moves
 
 

@@ -25,8 +25,6 @@ from manip_il.tasks.objects import (
     observe_object,
 )
 from manip_il.tasks.starts import (
-    LIFT,
-    LIFT_HEIGHT,
     UPRIGHT,
     draw_few,
     draw_goal,
@@ -35,6 +33,9 @@ from manip_il.tasks.starts import (
 )
 
 OBJECT = "object"
+LIFT = (0.1, 0.25)  # height of a lift's goal above the object's start [m]
+# workspace height from which the full `LIFT` is used; lower workspaces scale it down [m]
+LIFT_HEIGHT = 0.45
 ANY_SHAPE = 200  # horizon: small or rolling objects take more attempts than a cube
 
 

@@ -131,7 +131,7 @@ def _free_yaw(world: World) -> float | None:
     None if there is room all around.
     """
     x, y, _ = world.at(asked(world)).tolist()
-    along, across, _ = np.array([world.at(one) for one in BINS.values()]).T.tolist()
+    along, across, _ = np.array([world.at(box) for box in BINS.values()]).T.tolist()
     off = abs(y - across[0])
     beyond = max(min(along) - x, x - max(along)) - PITCH / 2
     if off > INSIDE[1] + BY_WALL or beyond > BY_WALL:
@@ -167,15 +167,6 @@ def _middle(world: World) -> tuple[float, float]:
     ]
     middle = (shifts[0] + shifts[-1]) / 2 if shifts else 0.0
     return x + min(SHIFT, max(-SHIFT, middle)), y
-
-
-def _draw_place(rng: np.random.Generator, world: World, name: str, side: float) -> F64:
-    """Draw a cube's resting place, (3,) [m], away from the bins. side: where the bins are, -1
-    (right) or 1 (left).
-    """
-    (x, y), wide = _middle(world), world.robot.workspace.half_width
-    along, across = rng.uniform(-1, 1) * wide, side * rng.uniform(-BEYOND, SIDE - FROM_BINS)
-    return np.array([x + along, y + across, resting_height(world, name)])
 
 
 _LET_GO, _CARRY = drop_rungs(
@@ -218,7 +209,7 @@ class Sort(Task):
 
         There is none if some bins were moved without the others and do not stand in a row.
         """
-        bins = np.array(sorted(world.at(one).tolist() for one in BINS.values()))
+        bins = np.array(sorted(world.at(box).tolist() for box in BINS.values()))
         row = bins[0] + np.outer(np.arange(len(bins)), [PITCH, 0.0, 0.0])
         return "" if np.abs(bins - row).max() < _IN_ROW else "the bins do not stand in a row"
 
@@ -236,18 +227,23 @@ class Sort(Task):
         """
         number, sentence = float(rng.integers(len(COLOURS))), float(rng.integers(len(SENTENCES)))
         poses: dict[str, tuple[F64, F64]] = {ASKED: (np.array([number, 0.0, sentence]), UPRIGHT)}
-        (x, y), hand = _middle(world), world.robot.workspace.centre
+        (x, y), space = _middle(world), world.robot.workspace
         side = rng.choice([-1.0, 1.0])
         for place, name in enumerate(rng.permutation(list(BINS.values())).tolist()):
             poses[name] = np.array([x + PITCH * (place - 1), y + side * SIDE, 0.0]), UPRIGHT
 
+        def draw_place(name: str) -> F64:  # away from the bins
+            along = rng.uniform(-1, 1) * space.half_width
+            across = side * rng.uniform(-BEYOND, SIDE - FROM_BINS)
+            return np.array([x + along, y + across, resting_height(world, name)])
+
         def fits(at: F64) -> bool:
             others = [poses[name][0] for name in COLOURS if name in poses]
             apart = all(math.dist(at, other) > APART for other in others)
-            return apart and math.dist(at[:2], hand) > FROM_HAND and world.reach.has(at)
+            return apart and math.dist(at[:2], space.centre) > FROM_HAND and world.reach.has(at)
 
         for name in COLOURS:
-            at = draw_until(partial(_draw_place, rng, world, name, side), fits, world, name)
+            at = draw_until(partial(draw_place, name), fits, world, name)
             poses[name] = at, draw_yaw(rng)
         return Start(poses)
 
@@ -263,8 +259,7 @@ class Sort(Task):
             **observe_object(world, name, "cube"),
             "bin_from_cube": world.at(BINS[name]) - world.at(name),
             "place_from_cube": _to(world) - world.at(name),
-            **{other: world.at(other) for other in COLOURS},
-            **{one: world.at(one) for one in BINS.values()},
+            **{body: world.at(body) for body in (*COLOURS, *BINS.values())},
         }
 
     def error(self, world: World) -> float:

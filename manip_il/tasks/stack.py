@@ -66,10 +66,6 @@ def _hand_is_away(world: World) -> bool:
     return world.ee.position[2] > world.at(TOP)[2] + grasp_of(world, TOP).half + AWAY_ENOUGH
 
 
-def _carry(world: World) -> Target:
-    return carry(world, TOP, place_on_base(world) - [0.0, 0.0, PRESS], OVER_BASE)
-
-
 def _let_go(world: World) -> Target:
     return let_go(world, TOP, grasp_of(world, TOP).half + AWAY)
 
@@ -87,7 +83,11 @@ class Stack(Task):
     rungs = (
         Rung("done", lambda w: stands(w) and _hand_is_away(w), _let_go),
         Rung("let_go", lambda w: stands(w) or _rests(w), _let_go),
-        Rung("carry", lambda w: is_held(w, TOP), _carry),
+        Rung(
+            "carry",
+            lambda w: is_held(w, TOP),
+            lambda w: carry(w, TOP, place_on_base(w) - [0.0, 0.0, PRESS], OVER_BASE),
+        ),
         *grasp_rungs(lambda w: TOP),
     )
 

@@ -15,10 +15,7 @@ UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # wxyz
 # least horizontal distance from hand to object, as in gymnasium-robotics' FetchPickAndPlace [m]
 FROM_HAND = 0.1
 FROM_HAND_SHARE = 0.75  # the same as a share of the workspace's half width, if that is less
-# workspace height from which the full `LIFT` is used; lower workspaces scale it down [m]
-LIFT_HEIGHT = 0.45
 IN_AIR = 0.5  # share of goals above the table, as in FetchPickAndPlace
-LIFT = (0.1, 0.25)  # height of a goal above the object's start [m]
 FEW_DRAWS = 50  # draws of one place before the other places are drawn again, too
 _MOST_DRAWS = 1_000
 _BOX, _SPHERE, _CAPSULE = (

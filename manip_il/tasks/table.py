@@ -33,20 +33,21 @@ from manip_il.tasks.stack import Stack
 
 SUFFIX = ".py"
 GROUP = "manip_il.tasks"  # entry-point group: maps a task's name to its class
-TASKS: dict[str, Task] = {
-    "reach": ReachGoal(),
-    "lift": Lift(),
-    "pick_place": PickPlace(),
-    "push": Push(),
-    "press": Press(),
-    "stack": Stack(),
-    "drawer": Drawer(),
-    "clear_table": ClearTable(),
-    "insert": Insert(),
-    "insert_tight": Insert("insert_tight", play=0.0005),
-    "sort": Sort(),
-    "carry": Carry(),
-}
+SHIPPED: tuple[Task, ...] = (
+    ReachGoal(),
+    Lift(),
+    PickPlace(),
+    Push(),
+    Press(),
+    Stack(),
+    Drawer(),
+    ClearTable(),
+    Insert(),
+    Insert("insert_tight", play=0.0005),
+    Sort(),
+    Carry(),
+)
+TASKS = {task.name: task for task in SHIPPED}
 
 
 def get_task(name: NameOrPath, shape: NameOrPath = "") -> Task:

@@ -22,7 +22,7 @@ from manip_il.sim.task import NO_PHASE, phases
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks import NAMES
 from manip_il.tasks.starts import UPRIGHT
-from manip_il.tasks.table import TASKS, get_task
+from manip_il.tasks.table import TASKS
 from manip_il.worlds.ladder import world
 from manip_il.worlds.ladder.world import make_env, scene_of
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config
@@ -38,13 +38,6 @@ RARE = {  # rungs with tests of their own
     "insert_tight": {"let_stand"},
     "sort": {"put_back"},
 }
-
-
-@every_task
-def test_a_task_has_the_name_that_it_is_called_by(task: str):
-    assert get_task(task) is TASKS[task]
-    assert TASKS[task].name == task
-    assert TASKS[task].instruction.endswith(".")
 
 
 def test_help_names_every_task():

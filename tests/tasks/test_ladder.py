@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -51,43 +50,43 @@ class Placed:
     )
 
     @property
-    def hand_yaw(self) -> float:
+    def hand_yaw(self):
         return angle_ahead(self.ee.rotation)
 
-    def ahead(self, position: np.ndarray) -> float:
+    def ahead(self, position):
         return 0.0
 
-    def off_down(self, yaw: float) -> float:
+    def off_down(self, yaw):
         return angle_from_down(self.ee.rotation, yaw)
 
-    def pose(self, name: str) -> Pose:
+    def pose(self, name):
         return {"object": self.cube}[name]
 
-    def at(self, name: str) -> np.ndarray:
+    def at(self, name):
         return self.pose(name).position
 
-    def extents(self, name: str) -> tuple[float, ...]:
+    def extents(self, name):
         return (self.edge,) * 3
 
-    def hull(self, name: str) -> None:
+    def hull(self, name):
         return None
 
-    def kind(self, name: str) -> int:
+    def kind(self, name):
         return int(mujoco.mjtGeom.mjGEOM_BOX)
 
-    def neighbours(self, name: str) -> tuple[tuple[float, float], ...]:
+    def neighbours(self, name):
         return self.around
 
-    def touched(self, name: str) -> bool:
+    def touched(self, name):
         return self.touching
 
-    def at_rest(self, name: str) -> bool:
+    def at_rest(self, name):
         return self.resting
 
-    def remember(self, key: Any, work_out: Callable[[], Any]) -> Any:
+    def remember(self, key, work_out):
         return work_out()
 
-    def moved(self, x: float, y: float, z: float) -> Placed:
+    def moved(self, x, y, z):
         return replace(self, ee=Pose(self.ee.position + [x, y, z], self.ee.rotation))
 
 
