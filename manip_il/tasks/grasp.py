@@ -42,20 +42,12 @@ _QUARTER = math.pi / 2
 _BOX, _SPHERE = int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_SPHERE)
 
 
-class Candidate(NamedTuple):
-    """One way to grasp an object.
+_MIDDLE = (0.0, 0.0, 0.0)
 
-    Attributes:
-        yaw: The yaw of a downward hand [rad].
-        width: The object's width between the fingers [m].
-        length: The object's length across the fingers [m].
-        centre: The vector from the object's centre to the middle between the fingers, (3,) [m].
-    """
-
-    yaw: float
-    width: float
-    length: float
-    centre: Sequence[float] = (0.0, 0.0, 0.0)
+# A way to grasp an object: the yaw of a downward hand [rad], the object's width between the fingers
+# and its length across them [m], and the vector from its centre to the middle between them, (3,)
+# [m]. A plain tuple, since every label makes some.
+Candidate = tuple[float, float, float, Sequence[float]]
 
 
 class Lie(NamedTuple):
@@ -83,7 +75,7 @@ class Lie(NamedTuple):
     @property
     def yaw(self) -> float:
         """Yaw of the first grasp [rad]."""
-        return self.grasps[0].yaw
+        return self.grasps[0][0]
 
 
 class Grasp(NamedTuple):
@@ -157,8 +149,8 @@ def lie_of(world: World, name: str) -> Lie:
     ahead, left, up = rotation[:, 2].tolist()
     if kind == _SPHERE or abs(up) > math.sqrt(0.5):
         tilt = 0.0 if kind == _SPHERE else math.acos(min(1.0, abs(up)))
-        return Lie((Candidate(0.0, width, width),), length, tilt, 0)
-    grasps = _half_turns(Candidate(math.atan2(left, ahead), width, length))
+        return Lie([(0.0, width, width, _MIDDLE)], length, tilt, 0)
+    grasps = _half_turns(math.atan2(left, ahead), (width, length), _MIDDLE)
     return Lie(grasps, width, math.asin(abs(up)), 2)
 
 
@@ -168,10 +160,11 @@ def grasp_of(world: World, name: str) -> Grasp:
     ee, gripper = world.ee, world.gripper
     lie, neighbours = lie_of(world, name), world.neighbours(name)
     yaw, width, length, centre = _nearest(world, world.at(name), lie, neighbours)
-    place = world.at(name) + centre
-    x, y, z = place.tolist()
-    dx, dy, dz = (place - ee.position).tolist()
-    offset = [a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist()]
+    x, y, z = (world.at(name) + centre).tolist()
+    ee_x, ee_y, ee_z = ee.position.tolist()
+    offset = [
+        a * (x - ee_x) + b * (y - ee_y) + c * (z - ee_z) for a, b, c in ee.rotation.T.tolist()
+    ]
     offset[1] -= gripper.middle(width)
     lean = 0.0 if world.robot.leans else world.reach.lean((x, y, z))
     angle, may_lean = world.off_down(yaw), min(angle_off_vertical(ee.rotation), lean * LEAN)
@@ -180,11 +173,10 @@ def grasp_of(world: World, name: str) -> Grasp:
     # offset of the object for one moving jaw [m]
     aside = gripper.middle(width + 2 * BESIDE_JAW)
     at_x, at_y = x - aside * math.sin(yaw), y + aside * math.cos(yaw)
-    ee_x, ee_y, _ = ee.position.tolist()
     way, radius = (at_x - ee_x, at_y - ee_y), FUNNEL_RADIUS
     crowding = _crowding(yaw, gripper.most, neighbours)
     if gripper.lopsided:
-        way, radius = _beside_jaw(*way, yaw, around=-dz < half), BY_JAW
+        way, radius = _beside_jaw(*way, yaw, around=ee_z - z < half), BY_JAW
         crowding = 1.0
     room = max(0.0, gripper.most - width)  # clearance of the open gripper [m]
     free = min(ANGLE_FREE, TIGHT * room / width)
@@ -237,11 +229,11 @@ def _nearest(
     if world.robot.faces_ahead:
         at = world.turned(position)
         grasps = [
-            grasp._replace(yaw=yaw)
-            for grasp in grasps
-            for yaw in (world.turns(grasp.yaw, math.pi, position) if lie.folds else (0.0,))
+            (turn, width, length, centre)
+            for yaw, width, length, centre in grasps
+            for turn in (world.turns(yaw, math.pi, position) if lie.folds else (0.0,))
         ]
-    narrowest = min(grasp.width for grasp in grasps)
+    narrowest = min([width for _, width, _, _ in grasps])
 
     def cost(grasp: Candidate) -> tuple[bool, float, float]:
         yaw, width, _, _ = grasp
@@ -249,8 +241,8 @@ def _nearest(
         too_wide = width > widest and width > narrowest
         return too_wide, turn + CROWDED * _crowding(yaw + ahead, widest, neighbours), yaw
 
-    best = min(grasps, key=cost)
-    return best._replace(yaw=best.yaw + ahead)
+    yaw, width, length, centre = min(grasps, key=cost)
+    return yaw + ahead, width, length, centre
 
 
 def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float]]) -> float:
@@ -266,10 +258,10 @@ def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float
     return worst
 
 
-def _half_turns(grasp: Candidate) -> list[Candidate]:
+def _half_turns(yaw: float, size: tuple[float, float], centre: Sequence[float]) -> list[Candidate]:
     """A grasp at the yaw nearest to 0, and half a turn to either side of it."""
-    yaw = grasp.yaw - math.pi * round(grasp.yaw / math.pi)
-    return [grasp._replace(yaw=yaw + turn) for turn in (0.0, -math.pi, math.pi)]
+    yaw -= math.pi * round(yaw / math.pi)
+    return [(yaw + turn, *size, centre) for turn in (0.0, -math.pi, math.pi)]
 
 
 def _hull_lie(hull: Hull, rotation: F64) -> Lie:
@@ -280,8 +272,8 @@ def _hull_lie(hull: Hull, rotation: F64) -> Lie:
     grasps: list[Candidate] = []
     acrosses, centres = rest.across.dot(rotation.T).tolist(), rest.centre.dot(rotation.T).tolist()
     for (ahead, left, _), size, centre in zip(acrosses, rest.sizes, centres, strict=True):
-        grasp = Candidate(math.atan2(left, ahead) + _QUARTER, *size, centre)
-        grasps += [grasp._replace(yaw=0.0)] if rest.round else _half_turns(grasp)
+        yaw = math.atan2(left, ahead) + _QUARTER
+        grasps += [(0.0, *size, centre)] if rest.round else _half_turns(yaw, size, centre)
     folds = 0 if rest.round else 2
     return Lie(grasps, rest.tall, tilt, folds, above=rest.above, fits=rest.fits)
 
@@ -302,9 +294,9 @@ def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
     if quarters % 2:
         length, width = width, length
     grasps = (
-        Candidate(yaw, width, length),
-        Candidate(yaw - _QUARTER, length, width),
-        Candidate(yaw + _QUARTER, length, width),
+        (yaw, width, length, _MIDDLE),
+        (yaw - _QUARTER, length, width, _MIDDLE),
+        (yaw + _QUARTER, length, width, _MIDDLE),
     )
     folds = 4 if length == width else 2
     tilt = math.acos(min(1.0, heights[up]))
@@ -323,4 +315,4 @@ def share(number: float) -> float:
 
 def is_inside(offset: Sequence[float] | F64, box: tuple[float, float, float]) -> bool:
     """Return whether an offset (3,) [m] is within a box's half lengths (3,) [m]."""
-    return all(abs(part) <= most for part, most in zip(offset, box, strict=True))
+    return abs(offset[0]) <= box[0] and abs(offset[1]) <= box[1] and abs(offset[2]) <= box[2]

@@ -103,8 +103,9 @@ def rise_first(at: F64, to: Sequence[float] | F64) -> F64:
 
     It is straight up if the point is far below the other.
     """
-    sideways = share(1.0 - (to[2] - at[2]) / RISE_FIRST)
-    return np.append((at + sideways * (to - at))[:2], to[2])
+    (x, y, z), (to_x, to_y, to_z) = at.tolist(), to
+    sideways = share(1.0 - (to_z - z) / RISE_FIRST)
+    return np.array([x + sideways * (to_x - x), y + sideways * (to_y - y), to_z])
 
 
 def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> Target:

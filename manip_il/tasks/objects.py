@@ -187,7 +187,7 @@ def observe_object(world: World, name: str, known_as: str = "") -> Observed:
     only_cubes = not world.scene.draws_shape and is_cube(world, name)
     folds = "4" if only_cubes else ""
     # numbers of the narrowest grasp change continuously as the object turns
-    yaw, width, length, centre = min(lie.grasps, key=lambda grasp: grasp.width)
+    yaw, width, length, centre = min(lie.grasps, key=lambda grasp: grasp[1])
     seen: dict[str, F64 | float] = {
         f"cos{folds}yaw": math.cos(lie.folds * yaw),
         f"sin{folds}yaw": math.sin(lie.folds * yaw),

@@ -158,7 +158,7 @@ def grip_of(world: World) -> Grip:
     position = world.at(PEG) + (LENGTH / 2 - FROM_END) * axis
     yaw, pitch = math.atan2(axis[1], axis[0]), 0.0
     if stands(world):
-        yaws = [grasp.yaw for grasp in lie_of(world, PEG).grasps]
+        yaws = [yaw for yaw, _, _, _ in lie_of(world, PEG).grasps]
         yaw = min(yaws, key=lambda yaw: _far_turn(world, yaw))
     else:
         room = _farthest(world.scene) - position[0]

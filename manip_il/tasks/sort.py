@@ -146,7 +146,7 @@ def _approach(world: World, name: str, hover: float) -> Target:
         return target
     ee, g = world.ee, grasp_of(world, name)
     hand = angle_ahead(ee.rotation)
-    yaws = (grasp.yaw for grasp in lie_of(world, name).grasps)
+    yaws = (yaw for yaw, _, _, _ in lie_of(world, name).grasps)
     yaw = min(yaws, key=lambda yaw: (round(abs(math.sin(yaw - free)), 6), abs(yaw - hand)))
     low = g.at[2] + g.half + CLEAR if angle_from_down(ee.rotation, yaw) > TURNED else 0.0
     return Target(
