@@ -119,12 +119,8 @@ def check_inputs(config: RunConfig) -> None:
             raise ManipError(
                 f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; {advice}"
             )
-        check_same_sources(
-            (root, Path(run)),
-            (given.spec, here),
-            pictures=config.cameras is not None,
-            language=False,
-        )
+        specs = {root: given.spec, run: here}
+        check_same_sources(specs, pictures=config.cameras is not None, language=False)
         check_same_spec(str(root), given.spec, run, here, ["sim_state_size"])
         if odd := sorted(features(given.spec).keys() ^ features(here).keys()):
             raise ManipError(

@@ -12,6 +12,7 @@ resumed from its last finished iteration ends with the same bytes.
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -52,11 +53,11 @@ from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
 from manip_il.learn.network import threads
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
+    STEP_FILE,
     TRAINING_STATE,
     last_checkpoint,
     new_checkpoint,
     read_step,
-    write_own_files,
 )
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
@@ -349,7 +350,9 @@ class Agent:
             (new / TRAINING_STATE).mkdir()
             save_modules(self._modules, new / TRAINING_STATE)
             step = {"step": self.number, "simulated": self.simulated, "metrics": self.metrics}
-            write_own_files(new, origin, step | {"validated_at": self.validated_at})
+            step["validated_at"] = self.validated_at
+            (new / TRAINING_STATE / STEP_FILE).write_text(json.dumps(step))
+            origin.write(new / PRETRAINED_MODEL)
 
     def load(self, folder: Path) -> None:
         """Load a checkpoint to continue from. Raises `ManipError` if it is incomplete."""

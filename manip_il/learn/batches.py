@@ -4,9 +4,7 @@ While training, pictures can be cropped and recoloured at random.
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -71,11 +69,6 @@ def to_float(pictures: Tensor) -> Tensor:
     loader.
     """
     return pictures.to(torch.float32).div_(255)
-
-
-def pictures_to_float(batch: dict[str, Any], cameras: Iterable[str]) -> dict[str, Any]:
-    """Return the batch with its uint8 pictures, (B, 3, H, W), as float32 in [0, 1]."""
-    return batch | {key: to_float(batch[key]) for key in cameras}
 
 
 @dataclass(frozen=True)

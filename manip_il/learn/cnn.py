@@ -17,10 +17,10 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, check_same_spec
+from manip_il.data.schema import ENVIRONMENT_STATE, STATE, check_same_spec
 from manip_il.errors import UsageError, shorten
 from manip_il.learn.checkpoint import MOST_VALUES
-from manip_il.learn.mlp import MLPConfig, MLPPolicy, labelled
+from manip_il.learn.mlp import MLPConfig, MLPPolicy, labelled, table_of
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork, NetworkConfig, fit_statistics, perceptron
@@ -313,9 +313,7 @@ class CNNPolicy(MLPPolicy):
         found, own = states.spec, pictures[0].spec
         also = () if UNKNOWN_TASK in (found.task, own.task) else ("task",)
         check_same_spec(str(states.root), found, str(pictures[0].root), own, also)
-        columns = states.columns([STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID])
-        columns[ENVIRONMENT_STATE] = columns[ENVIRONMENT_STATE].reshape(len(states), -1)
-        kept = [labelled(one, [STATE, ENVIRONMENT_STATE]) for one in (table, columns)]
+        kept = [labelled(one, [STATE, ENVIRONMENT_STATE]) for one in (table, table_of(states))]
         self._states = tuple(torch.cat(parts) for parts in zip(*kept, strict=True))
         self.model.learn_statistics(*self._states)
 

@@ -23,7 +23,7 @@ from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.names import EE_DELTA
 from manip_il.learn.network import MLPNetwork, NetworkConfig
-from manip_il.learn.samples import Table, valid_frames
+from manip_il.learn.samples import Table, label_valid
 
 __path__: list[str] = []
 
@@ -195,20 +195,22 @@ def training_table(config: MLPConfig, dataset_meta: Any) -> Table:
             f"{EE_DELTA} needs the robot's kinematics, which LeRobot does not have; train with"
             " manip-il train"
         )
-    names = [
-        key
-        for key in (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)
-        if key in dataset_meta.features
-    ]
-    columns = Dataset.open(dataset_meta.root).columns(names)
-    return {key: column.reshape(len(column), -1) for key, column in columns.items()}
+    return table_of(Dataset.open(dataset_meta.root))
+
+
+def table_of(dataset: Dataset) -> Table:
+    """Return what an mlp learns from, by column, (N, d) each, and `label_valid`, (N,)."""
+    names = [key for key in (STATE, ENVIRONMENT_STATE, ACTION) if key in dataset.features]
+    columns = dataset.columns(names)
+    table = {key: column.reshape(len(column), -1) for key, column in columns.items()}
+    return table | {LABEL_VALID: label_valid(dataset)}
 
 
 def labelled(table: Table, inputs: Sequence[str]) -> tuple[Tensor, Tensor]:
     """Return the joined columns `inputs`, (S, d), and the actions, (S, n), of the frames with a
     valid label.
     """
-    valid = torch.from_numpy(valid_frames(table))
+    valid = torch.from_numpy(table[LABEL_VALID] != 0)
     seen, actions = (
         torch.cat([torch.from_numpy(table[key])[valid] for key in keys], dim=1).float()
         for keys in (inputs, [ACTION])

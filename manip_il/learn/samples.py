@@ -174,7 +174,7 @@ def load_data(
     cameras = [key for key in features if key in meta.camera_keys]
     numbers = [key for key in features if key not in cameras]
     table = joined_columns(meta.datasets, [*numbers, *_ALWAYS])
-    table[LABEL_VALID] = np.concatenate([_label_valid(dataset) for dataset in meta.datasets])
+    table[LABEL_VALID] = np.concatenate([label_valid(dataset) for dataset in meta.datasets])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     for key in numbers:
         # a column with one number per frame becomes a vector, too
@@ -186,7 +186,7 @@ def load_data(
     meta.table = table
     episodes = table[EPISODE_INDEX].astype(np.int64)
     windows = windows_of(policy, features, episodes)
-    usable = windows.usable(valid_frames(table), getattr(policy, "drop_n_last_frames", 0))
+    usable = windows.usable(table[LABEL_VALID] != 0, getattr(policy, "drop_n_last_frames", 0))
     train, held_out = split_by_episode(episodes[usable], eval_split, seed)
     if len(held_out) > _MAX_HELD_OUT:
         held_out = held_out[np.linspace(0, len(held_out) - 1, _MAX_HELD_OUT).astype(np.int64)]
@@ -203,21 +203,13 @@ def load_data(
     )
 
 
-def _label_valid(dataset: Dataset) -> NDArray[Any]:
-    """Return a dataset's `label_valid`, (N,): 1 without such a column."""
+def label_valid(dataset: Dataset) -> NDArray[Any]:
+    """Return a dataset's `label_valid`, (N,), which says whether a frame counts in the loss: 1
+    without such a column.
+    """
     if LABEL_VALID not in dataset.features:
         return np.ones(len(dataset), np.int64)
     return dataset.columns([LABEL_VALID])[LABEL_VALID].reshape(-1)
-
-
-def valid_frames(table: Table) -> NDArray[np.bool_]:
-    """Return whether each frame counts in the loss, (N,), by its `label_valid`.
-
-    All count without such a column.
-    """
-    if LABEL_VALID not in table:
-        return np.ones(len(table[ACTION]), dtype=bool)
-    return np.asarray(table[LABEL_VALID]).reshape(-1) != 0
 
 
 def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I64]:
@@ -232,12 +224,9 @@ def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I6
     Returns:
         Row numbers to train on, (N - h,), and to hold out, (h,), both ascending.
     """
-    names = np.unique(episodes)
+    names = np.random.default_rng([seed, 1]).permutation(np.unique(episodes))
     count = round(fraction * len(names))
-    if not 0 < count < len(names):
-        return np.arange(len(episodes)), np.arange(0)
-    held_out = np.random.default_rng([seed, 1]).permutation(names)[:count]
-    mask = np.isin(episodes, held_out)
+    mask = np.isin(episodes, names[: count % len(names)])
     return np.flatnonzero(~mask), np.flatnonzero(mask)
 
 

@@ -36,7 +36,12 @@ EVIL = {
 
 def test_what_a_policy_sees_gives_and_is_for_is_read_without_loading_it(pictured, tmp_path):
     origin = Origin.of(
-        pictured, {"mujoco": "3"}, {"steps": 2}, "both", {}, action_space="joint_target"
+        pictured,
+        {"mujoco": "3"},
+        {"steps": 2},
+        observation="both",
+        look={},
+        action_space="joint_target",
     )
     folder = write_checkpoint(tmp_path / "policy", "act", pictured, "both", origin=origin)
     (folder / "model.safetensors").write_bytes(b"")

@@ -331,19 +331,17 @@ def test_several_datasets_are_one_in_the_units_of_all_and_the_shares_asked_for(s
     assert max(int(trainer.batch(step)["index"].max()) for step in range(50)) < 20
 
 
-def test_datasets_that_mean_other_things_are_refused_with_both_named(spec, write, table):
-    one = write(table, "one")[0]
+def test_datasets_that_mean_other_things_are_refused_with_both_named(spec):
     for change, words in (
-        ({"robot": "leg"}, r"robot differs: .*one has arm, .*other has leg"),
-        ({"fps": 30}, r"fps differs: .*one has 25, .*other has 30"),
-        ({"task": "lift"}, r"task differs: .*one has reach, .*other has lift"),
+        ({"robot": "leg"}, r"robot differs: one has arm, other has leg"),
+        ({"fps": 30}, r"fps differs: one has 25, other has 30"),
+        ({"task": "lift"}, r"task differs: one has reach, other has lift"),
         ({"cameras": ("front",), "image_size": (32, 32), "video": False}, r"cameras differs"),
     ):
-        other = write(table, f"{next(iter(change))}/other", replace(spec, **change))[0]
-        both = (one.root, other.root), (one.spec, other.spec)
+        both = {"one": spec, "other": replace(spec, **change)}
         with pytest.raises(MismatchError, match=words):
-            check_same_sources(*both, pictures=True, language=False)
-    check_same_sources(*both, pictures=False, language=False)
+            check_same_sources(both, pictures=True, language=False)
+    check_same_sources(both, pictures=False, language=False)
 
 
 # `torchrun --standalone --nproc_per_node=2`, with processes that need not import torch again
