@@ -48,8 +48,9 @@ _STEPS = (  # registry names of LeRobot's default steps, and ours: they load not
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 MOST_VALUES = 10_000  # in one numeric input of a network, or in its action
+_IK_ROBOT = "robot of the inverse kinematics"
 # prefix of dummy cameras that LeRobot's language policies fill in themselves
-_PLACEHOLDER = "empty_camera_"
+_PLACEHOLDER = IMAGES + "empty_camera_"
 
 
 @dataclass(frozen=True)
@@ -198,15 +199,8 @@ class Checkpoint:
             name: processor_steps(path / name) for name in PROCESSORS if (path / name).is_file()
         }
         with in_one_line(f"{path / CONFIG} has features that cannot be read"):
-            inputs, outputs = (
-                _features(config["input_features"]),
-                _features(config["output_features"]),
-            )
-            sizes = {
-                key.removeprefix(IMAGES): shape[1:]
-                for key, (kind, shape) in inputs.items()
-                if kind == "VISUAL"
-            }
+            inputs = _features(config["input_features"])
+            outputs = _features(config["output_features"])
             space, robot, grippers = _space(config, processors.get(PROCESSORS[1], []))
             return cls(
                 path,
@@ -218,9 +212,9 @@ class Checkpoint:
                     if kind in ("STATE", "ENV") and all(shape)
                 },
                 pictures={
-                    name: (height, width)
-                    for name, (height, width) in sizes.items()
-                    if not name.startswith(_PLACEHOLDER)
+                    key.removeprefix(IMAGES): (shape[1], shape[2])
+                    for key, (kind, shape) in inputs.items()
+                    if kind == "VISUAL" and not key.startswith(_PLACEHOLDER)
                 },
                 action=_size(ACTION, outputs[ACTION][1]),
                 space=space,
@@ -280,16 +274,18 @@ class Checkpoint:
             self.origin.check_fits(spec)
         environment, joints = f"{spec.robot}/{spec.task}", len(spec.joint_names)
         has: dict[str, Any] = {
-            "robot of the inverse kinematics": spec.robot,
+            _IK_ROBOT: spec.robot,
             STATE: joints,
             ACTION: joints,
+            ENVIRONMENT_STATE: len(spec.environment_state_names),
+            **dict.fromkeys(spec.image_keys, spec.image_size),
         }
-        has |= {ENVIRONMENT_STATE: len(spec.environment_state_names)} | dict.fromkeys(
-            spec.image_keys, spec.image_size
-        )
-        needs: dict[str, Any] = {**self.numbers, ACTION: self.action}
-        needs |= {IMAGES + camera: size for camera, size in self.pictures.items()}
-        needs |= {"robot of the inverse kinematics": self.robot} if self.robot else {}
+        needs: dict[str, Any] = {
+            **self.numbers,
+            ACTION: self.action,
+            **{IMAGES + camera: size for camera, size in self.pictures.items()},
+            **({_IK_ROBOT: self.robot} if self.robot else {}),
+        }
         for what, needed in needs.items():
             if has.get(what) != needed:
                 raise MismatchError(what, "the policy", needed, environment, has.get(what))

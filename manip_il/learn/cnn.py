@@ -23,7 +23,7 @@ from manip_il.learn.checkpoint import MOST_VALUES
 from manip_il.learn.mlp import MLPConfig, MLPPolicy, labelled, table_of
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
-from manip_il.learn.network import MLPNetwork, NetworkConfig, fit_statistics, perceptron
+from manip_il.learn.network import MLPNetwork, NetworkConfig, fit_statistics, inverse, perceptron
 from manip_il.learn.samples import Table
 from manip_il.option import bounded, option
 
@@ -214,11 +214,7 @@ class CNNPolicy(MLPPolicy):
                     -config.clamp, config.clamp
                 )
                 parts.append(self.privileged(encoded))
-                varies = self.truth_scale > 0
-                deviation = torch.where(
-                    varies, 1.0 / self.truth_scale, torch.zeros_like(self.truth_scale)
-                )
-                around = self.truth_mean + deviation * parts[1]
+                around = self.truth_mean + inverse(self.truth_scale) * parts[1]
                 if config.states:
                     return torch.cat([batch[STATE], around], dim=-1)
             if around is not None and self.offsets:
@@ -229,12 +225,8 @@ class CNNPolicy(MLPPolicy):
         """Return a camera's pictures (B, 3, H, W) at the size used in training, reduced by
         averaging if larger.
         """
-        size = tuple((self.config.input_features or {})[key].shape[1:])
-        return (
-            batch[key]
-            if batch[key].shape[2:] == size
-            else interpolate(batch[key], size, mode="area")
-        )
+        pictures, size = batch[key], tuple((self.config.input_features or {})[key].shape[1:])
+        return pictures if pictures.shape[2:] == size else interpolate(pictures, size, mode="area")
 
     @override
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:

@@ -45,12 +45,6 @@ class _Episode:
     seed: int = 0
     memory: Any = None
 
-    def begin_step(self) -> None:
-        """Count a step, and set its seed."""
-        sequence = np.random.SeedSequence([self.number, self.steps])
-        self.seed = int(sequence.generate_state(1, np.uint64)[0])
-        self.steps += 1
-
 
 class EpisodePolicy:
     """A LeRobot policy with its processors and one memory per episode.
@@ -87,24 +81,20 @@ class EpisodePolicy:
         }
         running = [self._episodes[number] for number in episodes]
         for episode in running:
-            episode.begin_step()
+            sequence = np.random.SeedSequence([episode.number, episode.steps])
+            episode.seed = int(sequence.generate_state(1, np.uint64)[0])
+            episode.steps += 1
         # mixed precision if the policy was trained with it, as in lerobot-eval
-        half = (
-            torch.autocast(self._device.type)
-            if self.module.config.use_amp
-            else contextlib.nullcontext()
-        )
+        half = torch.autocast(self._device.type, enabled=self.module.config.use_amp)
         with in_one_line("the policy cannot act"), half:
             if self.module.config.type == "diffusion":
                 actions = self._after(self._planned(self._observed(batch, running), running))
             else:
-                rows = (
-                    {key: value[i : i + 1] for key, value in batch.items()}
-                    for i in range(len(running))
-                )
-                actions = torch.cat(
-                    [self._act_alone(*pair) for pair in zip(rows, running, strict=True)]
-                )
+                alone = [
+                    self._act_alone({key: value[i : i + 1] for key, value in batch.items()}, one)
+                    for i, one in enumerate(running)
+                ]
+                actions = torch.cat(alone)
         return actions.to("cpu", torch.float32)
 
     def begin(self, instructions: Mapping[int, str]) -> None:

@@ -139,6 +139,11 @@ def _mean_and_deviation(values: F32) -> tuple[F64, F64]:
     return mean, np.sqrt(np.square(values - mean).mean(0))
 
 
+def inverse(scale: Tensor) -> Tensor:
+    """Return 1 / scale, (n,), and 0 for a scale of 0."""
+    return torch.where(scale > 0, 1.0 / scale, torch.zeros_like(scale))
+
+
 def perceptron(
     inputs: int, width: int, depth: int, outputs: int, activation: type[nn.Module]
 ) -> nn.Sequential:
@@ -238,10 +243,7 @@ class MLPNetwork(nn.Module):
 
         0 for a target with scale 0.
         """
-        inverse = torch.where(
-            self.target_scale > 0, 1.0 / self.target_scale, torch.zeros_like(self.target_scale)
-        )
-        return (targets - self.target_mean) * inverse
+        return (targets - self.target_mean) * inverse(self.target_scale)
 
     def row_losses(self, inputs: Tensor, actions: Tensor) -> Tensor:
         """Return the loss of each row, (B,), for raw inputs (B, n + k) and absolute actions (B,
@@ -334,10 +336,8 @@ def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
     # offset
     first = network.layers[0]
     assert isinstance(first, torch.nn.Linear)
-    offset, scale = (
-        (kept["input_mean"] - network.input_mean) * network.input_scale,
-        kept["input_scale"],
-    )
+    scale = kept["input_scale"]
+    offset = (kept["input_mean"] - network.input_mean) * network.input_scale
     first.bias.add_(first.weight @ offset)
     first.weight.mul_(torch.where(scale > 0, network.input_scale / scale, torch.zeros_like(scale)))
     network.set_statistics(kept)

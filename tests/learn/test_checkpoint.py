@@ -88,15 +88,9 @@ def test_an_environment_that_lacks_an_input_is_refused_by_both_names(change, wor
         replace(Checkpoint.open(act), **change).check_fits(pictured)
 
 
-@pytest.mark.parametrize(
-    "change", [{"robot": "leg"}, {"fps": 50}, {"joint_names": ("a", "c", "b", "gripper")}]
-)
-def test_a_policy_for_something_else_is_refused_naming_both(change, act, spec):
-    with pytest.raises(MismatchError) as error:
-        Checkpoint.open(act).check_fits(replace(spec, **change))
-    ((name, value),) = change.items()
-    assert str(value) in str(error.value)
-    assert str(getattr(spec, name)) in str(error.value)
+def test_a_policy_for_something_else_is_refused_naming_both(act, spec):
+    with pytest.raises(MismatchError, match=r"fps differs: the policy has 25, .* has 50"):
+        Checkpoint.open(act).check_fits(replace(spec, fps=50))
 
 
 @pytest.mark.parametrize(
