@@ -43,6 +43,12 @@ MISTAKES: dict[str, Callable[[Path], object]] = {
     "unknown option 'roundz' (did you mean 'rounds'?)": lambda folder: manip_il.dagger(
         folder, "panda", roundz=3
     ),
+    "the weights of 1 datasets are [1, 2]; expected a number above 0 for each": lambda folder: (
+        manip_il.train(SAMPLE, folder / "run", shares=[1, 2])
+    ),
+    "give it alone, without shares": lambda folder: manip_il.train(
+        SAMPLE, folder / "run", shares=[1], weights=folder / "rabc.parquet"
+    ),
     "is not a LeRobot dataset": lambda folder: manip_il.train(folder, folder / "clone"),
 }
 

@@ -1,7 +1,6 @@
 """Run DAgger, or another algorithm of imitation, in a folder."""
 
 import json
-import logging
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,6 @@ from manip_il.option import make_options
 from manip_il.progress import Progress
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import env_fingerprint, env_of_name, env_spec
-
-_LOG = logging.getLogger(__name__)
 
 
 def dagger(
@@ -113,11 +110,9 @@ def check_inputs(config: RunConfig) -> None:
     for root in config.datasets:
         given = open_dataset(root)
         if SIM_STATE not in given.features:
-            advice = (
-                "train a policy on it with manip-il train, and start from that: --policy.path=RUN"
-            )
             raise ManipError(
-                f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; {advice}"
+                f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; train a policy on"
+                " it with manip-il train, and start from that: --policy.path=RUN"
             )
         specs = {root: given.spec, run: here}
         check_same_sources(specs, pictures=config.cameras is not None, language=False)

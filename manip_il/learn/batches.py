@@ -49,12 +49,10 @@ class Order:
         if self._edges is not None:
             draws = np.random.default_rng([self.seed, step]).uniform(size=self.batch_size)
             return np.minimum(np.searchsorted(self._edges, draws, side="right"), self.rows - 1)
-        start, end = step * self.batch_size, (step + 1) * self.batch_size
-        epochs = [
-            (epoch, epoch * self.rows) for epoch in range(start // self.rows, -(-end // self.rows))
-        ]
+        drawn = np.arange(self.batch_size) + step * self.batch_size
+        epochs, places = np.divmod(drawn, self.rows)
         return np.concatenate(
-            [self._permutation(e)[max(start - first, 0) : end - first] for e, first in epochs]
+            [self._permutation(int(one))[places[epochs == one]] for one in np.unique(epochs)]
         )
 
     def _permutation(self, epoch: int) -> I64:

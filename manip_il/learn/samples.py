@@ -22,6 +22,7 @@ from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, TASK
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics
 from manip_il.errors import ManipError, MismatchError
+from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import in_one_line
 from manip_il.mdp import F64, I64, require_finite
 
@@ -148,7 +149,7 @@ def load_data(
     *,
     eval_split: float,
     seed: int,
-    encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]] | None = None,
+    conversion: Conversion | None = None,
     on_frames: Callable[[int], None] | None = None,
 ) -> Samples:
     """Return the samples of the concatenated datasets.
@@ -159,8 +160,7 @@ def load_data(
             encoded actions.
         eval_split: Share of the episodes that are held out.
         seed: Decides which episodes are held out.
-        encode: Maps actions (N, n) and states (N, n) to targets; None if the targets are the
-            datasets' actions.
+        conversion: Converts actions to targets; None if the targets are the datasets' actions.
         on_frames: Called with the number of newly decoded frames.
 
     Raises:
@@ -180,8 +180,8 @@ def load_data(
         # a column with one number per frame becomes a vector, too
         table[key] = table[key].reshape(len(table[key]), -1)
         require_finite(f"column {key}", table[key])
-    if encode is not None:
-        table[ACTION] = encode(table[ACTION].astype(np.float32), table[STATE])
+    if conversion is not None:
+        table[ACTION] = conversion.encode(table[ACTION].astype(np.float32), table[STATE])
         meta.stats |= column_statistics({ACTION: table[ACTION]})
     meta.table = table
     episodes = table[EPISODE_INDEX].astype(np.int64)

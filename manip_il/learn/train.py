@@ -149,7 +149,7 @@ class Trainer:
             self.meta,
             eval_split=config.eval_split,
             seed=config.seed,
-            encode=self.encoder.encode if self.encoder else None,
+            conversion=self.encoder,
             on_frames=on_frames,
         )
 

@@ -56,12 +56,8 @@ def test_what_a_policy_sees_gives_and_is_for_is_read_without_loading_it(pictured
     assert found.pictures == {"front": (32, 48), "wrist": (32, 48)}
     assert found.origin == origin
     found.check_fits(pictured)
-    edit_config(
-        folder,
-        input_features={
-            "observation.images.empty_camera_0": {"type": "VISUAL", "shape": [3, 48, 64]}
-        },
-    )
+    placeholder = {"observation.images.empty_camera_0": {"type": "VISUAL", "shape": [3, 48, 64]}}
+    edit_config(folder, input_features=placeholder)
     assert Checkpoint.open(folder).pictures == {}  # LeRobot fills it in itself
 
 
