@@ -43,8 +43,8 @@ class Workplace:
                 self._python_block(block)
             case "yaml":
                 self._yaml_block(block)
-            case _:
-                pass
+            case language:
+                assert language in ("text", "toml"), f"{block.where}: the tests know no {language}"
 
     def run(self, line: Line) -> None:
         """One command, at a small size; fails unless it ends with exit code 0."""
