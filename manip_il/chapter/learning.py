@@ -24,6 +24,7 @@ import numpy as np
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from safetensors.torch import load_file, save_file
 
+from manip_il import checks
 from manip_il.algorithms.results import VALIDATION, Result, Stopwatch, best_validation, validations
 from manip_il.algorithms.run import Run
 from manip_il.chapter.config import LONGER, LearningConfig
@@ -57,7 +58,6 @@ from manip_il.learn.training_state import (
     TRAINING_STATE,
     last_checkpoint,
     new_checkpoint,
-    read_step,
 )
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
@@ -356,7 +356,7 @@ class Agent:
 
     def load(self, folder: Path) -> None:
         """Load a checkpoint to continue from. Raises `ManipError` if it is incomplete."""
-        step = read_step(folder)
+        step = checks.read_json(folder / TRAINING_STATE / STEP_FILE, "the step of a run")
         with in_one_line(f"{folder} cannot be resumed"), threads(1):
             self.number, self.simulated = int(step["step"]), int(step["simulated"])
             self.metrics, self.validated_at = dict(step["metrics"]), int(step["validated_at"])

@@ -451,11 +451,3 @@ def policy_folder(policy: Any) -> Path:
     takes.
     """
     return find_policy(Path(getattr(policy, "path", policy)).expanduser())
-
-
-def with_folder(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a fit's policy, with the `pretrained_model` folder that a `path`
-    among them leads to.
-    """
-    path = options.get("path")
-    return dict(options) if path is None else {**options, "path": str(policy_folder(path))}

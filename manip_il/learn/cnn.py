@@ -141,8 +141,6 @@ class CNNPolicy(MLPPolicy):
         Bit-identical whatever the other rows are.
         """
         state = batch[STATE]
-        if len(state) == 0:
-            return torch.empty_like(state)
         # The last bits of a convolution depend on the batch size, so one row at a time. Half
         # precision is for training.
         with torch.autocast(state.device.type, enabled=False):

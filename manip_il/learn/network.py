@@ -128,8 +128,14 @@ def fit_statistics(inputs: F32, targets: F32, loss: str) -> Statistics:
     input_scale = np.where(
         deviation < CONSTANT_INPUT, 0.0, 1.0 / np.maximum(deviation, CONSTANT_INPUT)
     )
-    found = {"input_mean": input_mean, "input_scale": input_scale, "target_mean": target_mean}
-    found |= {"target_scale": target_scale, "target_low": low, "target_high": high}
+    found = {
+        "input_mean": input_mean,
+        "input_scale": input_scale,
+        "target_mean": target_mean,
+        "target_scale": target_scale,
+        "target_low": low,
+        "target_high": high,
+    }
     return {name: torch.from_numpy(values.astype(np.float32)) for name, values in found.items()}
 
 

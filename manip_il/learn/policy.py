@@ -191,7 +191,7 @@ class _Perceptron:
         self.module.to(device).eval()
         # the network converts joint_delta
         space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET
-        self._conversion = Conversion(space, checkpoint.robot)
+        self._decode = Conversion(space, checkpoint.robot).decode
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action per row, (B, n).
@@ -200,12 +200,8 @@ class _Perceptron:
         action space.
         """
         inputs = torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)
-        targets = self.module.act(inputs)
-        if self._conversion.space == JOINT_TARGET:
-            return targets
-        return torch.from_numpy(
-            self._conversion.decode(targets.cpu().numpy(), batch[STATE].numpy())
-        )
+        targets = self.module.act(inputs).cpu().numpy()
+        return torch.from_numpy(self._decode(targets, batch[STATE].numpy()))
 
     def begin(self, instructions: Mapping[int, str]) -> None:
         """Do nothing: the mlp has no memory, and does not read language."""

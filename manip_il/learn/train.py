@@ -35,7 +35,7 @@ from manip_il.errors import NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import Augment, Order, generator_of, to_float
-from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line, with_folder
+from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options, policy_config, set_features
 from manip_il.learn.lerobot_policy import build_policy, build_processors, load_processors
@@ -428,7 +428,6 @@ def train(
     opened = [
         one if isinstance(one, Dataset) else Dataset.open(Path(one).expanduser()) for one in given
     ]
-    options["policy"] = with_folder(options.get("policy", {}))
     config = make_options(FitConfig, seed=stream_base("training", seed), **options)
     if weights is not None and (shares or len(opened) > 1):
         raise UsageError("weights are for the frames of one dataset; give it alone, without shares")

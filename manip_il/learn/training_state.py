@@ -22,9 +22,8 @@ import os
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from manip_il import checks
 from manip_il.data.atomic import CHECKPOINT, Record, append_line, new_folder, read_lines, write_file
 from manip_il.errors import FolderExistsError, UsageError
 
@@ -54,15 +53,6 @@ def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
     if not resume:
         raise FolderExistsError(output_dir)
     return last
-
-
-def read_step(checkpoint: Path) -> dict[str, Any]:
-    """Return what `training_step.json` in a checkpoint folder holds.
-
-    Raises:
-        ManipError: The file cannot be read.
-    """
-    return checks.read_json(checkpoint / TRAINING_STATE / STEP_FILE, "the step of a run")
 
 
 @contextmanager
