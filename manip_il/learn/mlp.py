@@ -83,11 +83,10 @@ class MLPConfig(NetworkConfig, PreTrainedConfig):
     def validate_features(self) -> None:
         """Raise unless `observation.state` and `action` exist and have the same size."""
         state, action = self.robot_state_feature, self.action_feature
-        shapes = [None if feature is None else feature.shape for feature in (state, action)]
-        if shapes[0] is None or len(shapes[0]) != 1 or shapes[0] != shapes[1]:
+        if not state or not action or len(state.shape) != 1 or state.shape != action.shape:
             raise UsageError(
-                f"the {self.type} policy needs observation.state and action of the same size; their"
-                f" shapes are {shapes[0]} and {shapes[1]}"
+                f"the {self.type} policy needs observation.state and action of the same size; they"
+                f" are {state} and {action}"
             )
 
     @override

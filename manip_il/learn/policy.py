@@ -109,7 +109,13 @@ class LearnedPolicy:
         """
         if not len(states):
             return np.empty((0, self.checkpoint.action))
-        batch = self._numbers(states, environment_states) | self._pictures(images or {})
+        numbers = {STATE: states, ENVIRONMENT_STATE: environment_states}
+        batch = {
+            key: torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+            for key, values in numbers.items()
+            if key in self.checkpoint.numbers
+        }
+        batch |= self._pictures(images or {})
         with threads(1):
             actions = self._policy.select(
                 batch, range(len(states)) if episodes is None else episodes
@@ -128,14 +134,6 @@ class LearnedPolicy:
                 means the `task` given to `load`.
         """
         self._policy.begin(instructions)
-
-    def _numbers(self, states: F32, environment_states: F32) -> Batch:
-        given = {STATE: states, ENVIRONMENT_STATE: environment_states}
-        return {
-            key: torch.from_numpy(np.ascontiguousarray(given[key], dtype=np.float32))
-            for key in given
-            if key in self.checkpoint.numbers
-        }
 
     def _pictures(self, images: Images) -> Batch:
         """Return pictures as in LeRobot's evaluation: float32 (B, 3, H, W), from 0 to 1."""

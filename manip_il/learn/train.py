@@ -9,7 +9,6 @@ Train a policy on datasets: behaviour cloning.
 
 import math
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -226,7 +225,6 @@ class Trainer:
         if self.accelerator.is_main_process:
             curves = self.config.tensorboard
             writers = metric_writers(self.output_dir, self.step, curves, self.pipeline)
-        self.pipeline.output_dir = _portable(self.output_dir)
         with threads(self.config.threads):
             for record in self.run():
                 for write in writers if record else []:
@@ -293,30 +291,27 @@ class Trainer:
         return self.data.batch(self.data.train[rows])
 
     def validate(self) -> dict[str, float]:
-        """Return the mean loss on samples of held-out episodes, without changing the random state
-        of training.
-
-        Also returns the other numbers that the policy outputs, such as the parts of its loss.
+        """Return the mean loss on samples of held-out episodes, if there are any, without changing
+        the random state of training.
         """
         held_out, size = self.data.held_out, self.pipeline.batch_size
         policy = self.unwrapped
         policy.eval()
-        sums = defaultdict[str, float](float)
+        total = 0.0
         with torch.no_grad(), torch.random.fork_rng(), self.accelerator.autocast():
             # policies that sample (diffusion) draw the same every time
             torch.manual_seed(self.config.seed)
             for start in range(0, len(held_out), size):
                 rows: I64 = held_out[start : start + size]
-                loss, outputs = policy.forward(self._prepared(self.data.batch(rows)))
-                for name, value in {**(outputs or {}), "loss": loss.item()}.items():
-                    if isinstance(value, int | float):
-                        sums[f"val_{name}"] += value * len(rows) / len(held_out)
-        return dict(sums)
+                loss, _ = policy.forward(self._prepared(self.data.batch(rows)))
+                total += loss.item() * len(rows)
+        return {"val_loss": total / len(held_out)} if len(held_out) else {}
 
     def save(self) -> None:
         """Write a checkpoint of this step and make it the last one."""
         if self.accelerator.is_main_process:
             steps = self.pipeline.steps
+            self.pipeline.output_dir = _portable(self.output_dir)
             with new_checkpoint(get_step_checkpoint_dir(self.output_dir, steps, self.step)) as new:
                 save_checkpoint(
                     new,
@@ -374,17 +369,11 @@ def _accelerator(policy: PreTrainedConfig) -> Accelerator:
     if not torch.distributed.is_initialized():
         state: Any = AcceleratorState
         state._reset_state(reset_partial_state=True)
-    # every process has equal buffers, except for the cnn's mean error
-    ours = policy.type in OWN_SPACE
     return Accelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,
         cpu=policy.device == "cpu",
-        kwargs_handlers=[
-            DistributedDataParallelKwargs(
-                find_unused_parameters=not ours, broadcast_buffers=not ours
-            )
-        ],
+        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
     )
 
 
