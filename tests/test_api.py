@@ -49,6 +49,7 @@ MISTAKES: dict[str, Callable[[Path], object]] = {
     "give it alone, without shares": lambda folder: manip_il.train(
         SAMPLE, folder / "run", shares=[1], weights=folder / "rabc.parquet"
     ),
+    "no dataset was given": lambda folder: manip_il.train([], folder / "run"),
     "is not a LeRobot dataset": lambda folder: manip_il.train(folder, folder / "clone"),
 }
 
@@ -81,7 +82,7 @@ def test_nothing_is_recorded_over_what_is_there(tmp_path: Path):
     with pytest.raises(UsageError, match=str(tmp_path)):
         manip_il.dagger(tmp_path, RunConfig(env))
     with pytest.raises(UsageError, match=str(tmp_path)):
-        manip_il.train([], tmp_path)
+        manip_il.train(SAMPLE, tmp_path)
     assert (tmp_path / "metrics.jsonl").read_text() == "mine\n"
 
 

@@ -14,7 +14,6 @@ row.
 
 import contextlib
 import copy
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -119,17 +118,13 @@ class EpisodePolicy:
         batch = {key: value for key, value in observed.items() if isinstance(value, Tensor)}
         if images := policy.config.image_features:
             batch[OBS_IMAGES] = torch.stack([batch[key] for key in images], dim=-4)
-        waiting: dict[int, list[_Episode]] = defaultdict(list)
         for i, episode in enumerate(episodes):
             if episode.memory is None:
                 policy.reset()
                 episode.memory = policy._queues
             populate_queues(episode.memory, {key: value[i : i + 1] for key, value in batch.items()})
-            if not episode.memory[ACTION]:
-                waiting[episode.number % ROWS].append(episode)
-        while waiting:
-            self._plan({row: asked.pop(0) for row, asked in waiting.items()})
-            waiting = {row: asked for row, asked in waiting.items() if asked}
+        while waiting := [episode for episode in episodes if not episode.memory[ACTION]]:
+            self._plan({episode.number % ROWS: episode for episode in waiting})
         return torch.cat([episode.memory[ACTION].popleft() for episode in episodes])
 
     def _plan(self, block: Mapping[int, _Episode]) -> None:
@@ -137,10 +132,12 @@ class EpisodePolicy:
         policy: Any = self.module
         model, config = policy.diffusion, policy.config
         weight = next(model.parameters())
-        generators = [torch.Generator(weight.device) for _ in range(ROWS)]
+        generators = [
+            torch.Generator(weight.device).manual_seed(block[row].seed if row in block else 0)
+            for row in range(ROWS)
+        ]
         batch: dict[str, Tensor] = {}
         for row, episode in block.items():
-            generators[row].manual_seed(episode.seed)
             for key, past in episode.memory.items():
                 if key != ACTION:
                     asked = torch.stack(list(past), dim=1)

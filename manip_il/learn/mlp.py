@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, override
 
+import numpy as np
 import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig
@@ -209,12 +210,9 @@ def labelled(table: Table, inputs: Sequence[str]) -> tuple[Tensor, Tensor]:
     """Return the joined columns `inputs`, (S, d), and the actions, (S, n), of the frames with a
     valid label.
     """
-    valid = torch.from_numpy(table[LABEL_VALID] != 0)
-    seen, actions = (
-        torch.cat([torch.from_numpy(table[key])[valid] for key in keys], dim=1).float()
-        for keys in (inputs, [ACTION])
-    )
-    return seen, actions
+    valid = table[LABEL_VALID] != 0
+    seen = np.concatenate([table[key][valid] for key in inputs], axis=1)
+    return torch.from_numpy(seen).float(), torch.from_numpy(table[ACTION][valid]).float()
 
 
 def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:

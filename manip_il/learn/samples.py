@@ -5,7 +5,7 @@ A sample may include frames around its own, its window, which LeRobot's policies
 `<column>_is_pad` marks them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -94,21 +94,6 @@ class Windows:
         return samples
 
 
-def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) -> Windows:
-    """Return the windows of a policy's training samples.
-
-    Args:
-        policy: The policy's options, which define the offsets.
-        columns: The columns that the policy observes, and the action.
-        episodes: The episode of every frame, (N,), ascending.
-    """
-    actions, observations = policy.action_delta_indices, policy.observation_delta_indices
-    wanted = {key: actions if key == ACTION else observations for key in columns}
-    return Windows(
-        episodes, {key: np.asarray(one, np.int64) for key, one in wanted.items() if one is not None}
-    )
-
-
 @dataclass(frozen=True)
 class Samples:
     """Samples in memory; a batch is one gather per column.
@@ -185,7 +170,11 @@ def load_data(
         meta.stats |= column_statistics({ACTION: table[ACTION]})
     meta.table = table
     episodes = table[EPISODE_INDEX].astype(np.int64)
-    windows = windows_of(policy, features, episodes)
+    deltas = dict.fromkeys(features, policy.observation_delta_indices)
+    deltas[ACTION] = policy.action_delta_indices
+    windows = Windows(
+        episodes, {key: np.asarray(one, np.int64) for key, one in deltas.items() if one is not None}
+    )
     usable = windows.usable(table[LABEL_VALID] != 0, getattr(policy, "drop_n_last_frames", 0))
     train, held_out = split_by_episode(episodes[usable], eval_split, seed)
     if len(held_out) > _MAX_HELD_OUT:

@@ -30,6 +30,7 @@ from lerobot.utils.random_utils import set_seed
 
 from manip_il.data.atomic import output_of, require_ours
 from manip_il.data.dataset import Dataset, JoinedDatasets
+from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
@@ -412,6 +413,8 @@ def train(
     """
     progress = progress or Progress()
     given = (datasets,) if isinstance(datasets, Data) else datasets
+    if not given:
+        raise UsageError("no dataset was given to train on")
     folder = Path(output_dir).expanduser()
     require_ours(folder, output_of("Train"))
     opened = [
@@ -420,7 +423,11 @@ def train(
     config = make_options(FitConfig, seed=stream_base("training", seed), **options)
     if weights is not None and (shares or len(opened) > 1):
         raise UsageError("weights are for the frames of one dataset; give it alone, without shares")
-    drawn = None if weights is None else _frame_weights(weights, opened[0], config)
+    drawn = None
+    if weights is not None:
+        ahead = getattr(policy_config(config), "chunk_size", None) or round(opened[0].fps)
+        episodes = opened[0].columns([EPISODE_INDEX])[EPISODE_INDEX].astype("int64")
+        drawn = rabc_weights(weights, episodes, ahead)
     pictures = sum(len(one) * len(one.cameras) for one in opened) if config.takes_images else 0
     progress.start("decode pictures, once", pictures)
     trainer = Trainer(
@@ -437,9 +444,3 @@ def train(
         f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps
     )
     return Checkpoint.open(trainer.fit(progress.log))
-
-
-def _frame_weights(path: Path, dataset: Dataset, config: FitConfig) -> F64:
-    episodes = dataset.columns(["episode_index"])["episode_index"].astype("int64")
-    ahead = getattr(policy_config(config), "chunk_size", None) or round(dataset.fps)
-    return rabc_weights(path, episodes, ahead)
