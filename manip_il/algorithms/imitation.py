@@ -17,7 +17,6 @@ from manip_il.data.schema import SIM_STATE, check_same_spec, features
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.sources import check_same_sources
 from manip_il.option import make_options
 from manip_il.progress import Progress
 from manip_il.worlds.config import EnvConfig
@@ -114,9 +113,9 @@ def check_inputs(config: RunConfig) -> None:
                 f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; train a policy on"
                 " it with manip-il train, and start from that: --policy.path=RUN"
             )
-        specs = {root: given.spec, run: here}
-        check_same_sources(specs, pictures=config.cameras is not None, language=False)
-        check_same_spec(str(root), given.spec, run, here, ["sim_state_size"])
+        pictured = ("cameras", "image_size") if config.cameras else ()
+        also = ("task", "sim_state_size", *pictured)
+        check_same_spec(str(root), given.spec, run, here, also)
         if odd := sorted(features(given.spec).keys() ^ features(here).keys()):
             raise ManipError(
                 f"only one of {root} and this run has {', '.join(odd)}; expected the same --cameras"
