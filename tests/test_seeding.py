@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.errors import UsageError
+from manip_il.errors import UnknownName, UsageError
 from manip_il.seeding import BLOCK, MAX_ROUNDS, MAX_SEED, rng_for, stream_base, stream_seeds
 
 NAMED = ("demonstrations", "training", "validation", "test", "certificate", "held_out")
@@ -35,6 +35,8 @@ def test_a_seed_out_of_range_is_refused(seed: int):
         UsageError, match=rf"seed is {seed}; expected a whole number from 0 to {MAX_SEED}"
     ):
         stream_base("test", seed)
+    with pytest.raises(UnknownName, match="unknown stream of seeds 'round/100'"):
+        stream_base("round/100")
 
 
 def test_one_purpose_draws_the_same_again_and_another_draws_anew():

@@ -84,15 +84,15 @@ class Result:
 
     def to_json(self) -> dict[str, Any]:
         """Return one line of `metrics.jsonl`."""
-        success = None if self.validated is None else self.validated.success
+        success = self.validated and self.validated.success
         return {
             self.unit: self.number,
             "steps": self.steps,
             "episodes": self.episodes,
             **self.metrics,
-            "validation_success": None if success is None else success.rate,
-            "validation_interval": None if success is None else list(success.interval),
-            "validation_episodes": None if success is None else success.n,
+            "validation_success": success and success.rate,
+            "validation_interval": success and list(success.interval),
+            "validation_episodes": success and success.n,
             "seconds": self.seconds,
         }
 

@@ -12,6 +12,7 @@ resumed from its last finished iteration ends with the same bytes.
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -23,6 +24,7 @@ import numpy as np
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from safetensors.torch import load_file, save_file
 
+from manip_il import checks
 from manip_il.algorithms.results import VALIDATION, Result, Stopwatch, best_validation, validations
 from manip_il.algorithms.run import Run
 from manip_il.chapter.config import LONGER, LearningConfig
@@ -52,11 +54,10 @@ from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
 from manip_il.learn.network import threads
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
+    STEP_FILE,
     TRAINING_STATE,
     last_checkpoint,
     new_checkpoint,
-    read_step,
-    write_own_files,
 )
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
@@ -349,11 +350,13 @@ class Agent:
             (new / TRAINING_STATE).mkdir()
             save_modules(self._modules, new / TRAINING_STATE)
             step = {"step": self.number, "simulated": self.simulated, "metrics": self.metrics}
-            write_own_files(new, origin, step | {"validated_at": self.validated_at})
+            step["validated_at"] = self.validated_at
+            (new / TRAINING_STATE / STEP_FILE).write_text(json.dumps(step))
+            origin.write(new / PRETRAINED_MODEL)
 
     def load(self, folder: Path) -> None:
         """Load a checkpoint to continue from. Raises `ManipError` if it is incomplete."""
-        step = read_step(folder)
+        step = checks.read_json(folder / TRAINING_STATE / STEP_FILE, "the step of a run")
         with in_one_line(f"{folder} cannot be resumed"), threads(1):
             self.number, self.simulated = int(step["step"]), int(step["simulated"])
             self.metrics, self.validated_at = dict(step["metrics"]), int(step["validated_at"])

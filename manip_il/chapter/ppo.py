@@ -9,6 +9,7 @@ iterations; they are saved as safetensors and JSON.
 
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,13 @@ from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import MIN_LOG_STD, GaussianHead, floored_log_std
 from manip_il.learn.mlp import MLPConfig, MLPPolicy
 from manip_il.learn.names import EE_DELTA, MLP
-from manip_il.learn.network import MLPNetwork, fit_statistics, perceptron, read_weights
+from manip_il.learn.network import (
+    MLPNetwork,
+    NetworkConfig,
+    fit_statistics,
+    perceptron,
+    read_weights,
+)
 from manip_il.mdp import F32
 from manip_il.worlds.contract import EnvironmentSpec
 
@@ -331,13 +338,13 @@ def start_policy(
     Raises:
         UsageError: If neither `start` nor `rows` is given.
     """
-    options = (start.mlp_options if start else None) or {}
+    options = asdict(NetworkConfig.of(start.config)) if start else {}
     options |= {
         "loss": _GAUSSIAN,
         "action_space": conversion.space,
         "grippers": conversion.grippers,
     }
-    config = MLPConfig(**{name: value for name, value in options.items() if name != "type"})
+    config = MLPConfig(**options)
     inputs = [STATE, *([ENVIRONMENT_STATE] if spec.environment_state_names else [])]
     config.input_features, config.output_features = policy_features(features(spec), inputs)
     policy = MLPPolicy(config)

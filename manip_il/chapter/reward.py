@@ -259,8 +259,8 @@ def write_reward(
     """
     origin = Origin.of(spec, fingerprint, options)
     config = {"type": PREFERENCE, **asdict(network.shape)}
-    for name, values in ((CONFIG, config), (META_FILE, origin.to_json())):
-        (folder / name).write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    (folder / CONFIG).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
+    origin.write(folder)
     save_file(
         {f"model.{name}": tensor for name, tensor in network.state_dict().items()}, folder / WEIGHTS
     )

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, override
 
+import numpy as np
 import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig
@@ -23,7 +24,7 @@ from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.names import EE_DELTA
 from manip_il.learn.network import MLPNetwork, NetworkConfig
-from manip_il.learn.samples import Table, valid_frames
+from manip_il.learn.samples import Table, label_valid
 
 __path__: list[str] = []
 
@@ -83,11 +84,10 @@ class MLPConfig(NetworkConfig, PreTrainedConfig):
     def validate_features(self) -> None:
         """Raise unless `observation.state` and `action` exist and have the same size."""
         state, action = self.robot_state_feature, self.action_feature
-        shapes = [None if feature is None else feature.shape for feature in (state, action)]
-        if shapes[0] is None or len(shapes[0]) != 1 or shapes[0] != shapes[1]:
+        if not state or not action or len(state.shape) != 1 or state.shape != action.shape:
             raise UsageError(
-                f"the {self.type} policy needs observation.state and action of the same size; their"
-                f" shapes are {shapes[0]} and {shapes[1]}"
+                f"the {self.type} policy needs observation.state and action of the same size; they"
+                f" are {state} and {action}"
             )
 
     @override
@@ -195,25 +195,24 @@ def training_table(config: MLPConfig, dataset_meta: Any) -> Table:
             f"{EE_DELTA} needs the robot's kinematics, which LeRobot does not have; train with"
             " manip-il train"
         )
-    names = [
-        key
-        for key in (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)
-        if key in dataset_meta.features
-    ]
-    columns = Dataset.open(dataset_meta.root).columns(names)
-    return {key: column.reshape(len(column), -1) for key, column in columns.items()}
+    return table_of(Dataset.open(dataset_meta.root))
+
+
+def table_of(dataset: Dataset) -> Table:
+    """Return what an mlp learns from, by column, (N, d) each, and `label_valid`, (N,)."""
+    names = [key for key in (STATE, ENVIRONMENT_STATE, ACTION) if key in dataset.features]
+    columns = dataset.columns(names)
+    table = {key: column.reshape(len(column), -1) for key, column in columns.items()}
+    return table | {LABEL_VALID: label_valid(dataset)}
 
 
 def labelled(table: Table, inputs: Sequence[str]) -> tuple[Tensor, Tensor]:
     """Return the joined columns `inputs`, (S, d), and the actions, (S, n), of the frames with a
     valid label.
     """
-    valid = torch.from_numpy(valid_frames(table))
-    seen, actions = (
-        torch.cat([torch.from_numpy(table[key])[valid] for key in keys], dim=1).float()
-        for keys in (inputs, [ACTION])
-    )
-    return seen, actions
+    valid = table[LABEL_VALID] != 0
+    seen = np.concatenate([table[key][valid] for key in inputs], axis=1)
+    return torch.from_numpy(seen).float(), torch.from_numpy(table[ACTION][valid]).float()
 
 
 def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:

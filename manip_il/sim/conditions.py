@@ -88,7 +88,7 @@ RANGES = {
     "action_noise": Quantity((0, 1)),
     "random_actions": Quantity((0, 1)),
     "knock": Quantity((0, 0.3), of_object=True),
-    "knock_step": Quantity((0, 10_000), draw=_whole),
+    "knock_step": Quantity((0, 10_000), of_object=True, draw=_whole),
     "joint_noise": Quantity((0, 1), "sensing"),
     "position_noise": Quantity((0, 1), "sensing", of_object=True),
     "delay": Quantity((0, 100), draw=_whole),
@@ -158,12 +158,10 @@ class Condition:
         checks.name("a condition's name", name)
         if "knock" in ranges:
             ranges = {"knock_step": _KNOCK_STEP} | ranges
+        elif "knock_step" in ranges:
+            raise UsageError(f"condition {name!r} has a knock_step but no knock; give both")
         ranges = {one: _range(name, one, range_) for one, range_ in ranges.items()}
-        kept = {
-            one: ranges[one]
-            for one in RANGES
-            if one in ranges and (one != "knock_step" or "knock" in ranges)
-        }
+        kept = {one: ranges[one] for one in RANGES if one in ranges}
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
     def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
@@ -189,7 +187,7 @@ class Condition:
         }
         if "size" in kept and sizes is not None:
             kept["size"] = _overlap(self.name, kept["size"], sizes)
-        if self.ranges and not kept.keys() - {"knock_step"}:
+        if self.ranges and not kept:
             return None
         return Condition(self.name, **kept)
 

@@ -15,7 +15,7 @@ from manip_il.cli.main import load, main
 from manip_il.cli.parsing import dump_yaml, options_of, parse
 from manip_il.cli.run.imitation import dagger_config, read_plan
 from manip_il.errors import ManipError, UsageError
-from manip_il.learn.checkpoint import find_policy, with_folder
+from manip_il.learn.checkpoint import find_policy
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options
 
@@ -128,11 +128,7 @@ def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, 
     run = make_run(here / "run", policy)
     task = ["--task.type=reach"] if command == "dagger" else []
     options = parse(load(command), [*REQUIRED.get(command, []), *task, "--policy.path=run"])
-    fit = (
-        dagger_config(options).fit
-        if command == "dagger"
-        else FitConfig(with_folder(options.fit["policy"]))
-    )
+    fit = dagger_config(options).fit if command == "dagger" else FitConfig(options.fit["policy"])
     assert (
         Path(lerobot_options(fit)[0].policy.pretrained_path).resolve() == find_policy(run).resolve()
     )

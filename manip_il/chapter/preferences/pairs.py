@@ -110,7 +110,8 @@ def read_all(roots: Sequence[Path]) -> list[Frames]:
     Raises `MismatchError` unless they have the same task and columns.
     """
     found = [read_frames(root) for root in roots]
-    check_same_sources(roots, [one.spec for one in found], pictures=False, language=False)
+    specs = {root: frames.spec for root, frames in zip(roots, found, strict=True)}
+    check_same_sources(specs, pictures=False, language=False)
     return found
 
 

@@ -7,7 +7,7 @@ Run `manip-il compare`: two policies or runs on the same seeds, or a study.
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,8 +47,10 @@ from manip_il.evaluation.side import (
 )
 from manip_il.evaluation.suites import varied
 from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
-from manip_il.learn.checkpoint import Checkpoint, with_folder
+from manip_il.learn.checkpoint import Checkpoint, policy_folder
 from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.names import MLP
+from manip_il.learn.network import NetworkConfig
 from manip_il.worlds.config import EnvConfig
 
 
@@ -89,7 +91,7 @@ def say_best(folder: Path, words: Sequence[str] = ()) -> None:
 
 def dagger_config(options: DaggerOptions) -> RunConfig:
     """Return the configuration of the run; raises if options contradict each other."""
-    policy, start = round_policy(with_folder(options.fit.get("policy", {})))
+    policy, start = round_policy(options.fit.get("policy", {}))
     observation, env = options.fit.get("observation"), env_config(options.env)
     sees = policy.get("type") == "cnn" and observation != "state"
     cameras = options.camera_config(env) if options.cameras or sees else None
@@ -118,13 +120,14 @@ def round_policy(settings: Open) -> tuple[Open, Checkpoint | None]:
     """
     if "path" not in settings:
         return settings, None
-    start = Checkpoint.open(Path(settings["path"]))
-    if (options := start.mlp_options) is None:
+    start = Checkpoint.open(policy_folder(settings["path"]))
+    if start.kind != MLP:
         return settings, start
     if "type" in settings:
         raise UsageError(
             "give one of --policy.path=DIR and --policy.type=...: the checkpoint sets the type"
         )
+    options = {"type": MLP} | asdict(NetworkConfig.of(start.config))
     return options | {name: value for name, value in settings.items() if name != "path"}, start
 
 

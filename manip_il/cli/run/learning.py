@@ -80,6 +80,8 @@ def imitation_config(options: GailOptions) -> LearningConfig:
     Raises if the demonstrations are not of one known environment.
     """
     roots = options.dataset.root
-    specs = [open_dataset(root).spec for root in roots]
-    check_same_sources(roots, specs, pictures=False, language=False)
-    return _config(options, specs[0], datasets=tuple(roots), discriminator=options.discriminator)
+    specs = {root: open_dataset(root).spec for root in roots}
+    check_same_sources(specs, pictures=False, language=False)
+    return _config(
+        options, specs[roots[0]], datasets=tuple(roots), discriminator=options.discriminator
+    )
