@@ -1,7 +1,7 @@
 """Meaning of a robot's action, number by number."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +10,8 @@ from manip_il.errors import MismatchError, NotFiniteError
 from manip_il.mdp import F64
 
 
-@dataclass(frozen=True, eq=False)
-class ServoUnits:
-    """Conversion of joints [rad] and a gripper opening [m] to servo units and back.
-
-    Servo units are degrees for a joint, and 0 to 100 for the gripper.
+class ServoUnits(NamedTuple):
+    """A gripper in the units of a robot with servos, whose joints are in degrees.
 
     Attributes:
         openings: Gripper openings [m], rising, (c,).
@@ -23,33 +20,6 @@ class ServoUnits:
 
     openings: F64
     percents: F64
-
-    def of(self, arm: F64, opening: float) -> tuple[F64, float]:
-        """Convert joints and a gripper opening to servo units.
-
-        Args:
-            arm: Joints, (n - 1,) [rad].
-            opening: Opening of the gripper [m].
-
-        Returns:
-            The joints, (n - 1,) [deg], and the gripper's position, 0 to 100.
-        """
-        return np.degrees(arm), float(np.interp(opening, self.openings, self.percents))
-
-    def back(self, arm: F64, percent: float) -> tuple[F64, float]:
-        """Convert servo units to joints and a gripper opening.
-
-        Args:
-            arm: Joints, (n - 1,) [deg].
-            percent: Position of the gripper, 0 to 100.
-
-        Returns:
-            The joints, (n - 1,) [rad], and the opening of the gripper [m].
-        """
-        order = np.argsort(self.percents)  # rising, as `interp` needs them
-        return np.radians(arm), float(
-            np.interp(percent, self.percents[order], self.openings[order])
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +59,7 @@ class ActionSpace:
             opening: Opening of the gripper [m].
         """
         if self.units is not None:
-            arm, opening = self.units.of(arm, opening)
+            arm, opening = np.degrees(arm), float(np.interp(opening, *self.units))
         action = np.empty(len(self.names))
         action[self.arm] = arm
         action[self.gripper] = opening
@@ -98,7 +68,11 @@ class ActionSpace:
     def split(self, action: F64) -> tuple[F64, float]:
         """Return joint values (n - 1,) [rad] and opening [m] of an action (n,)."""
         arm, gripper = action[self.arm], action[self.gripper]
-        return (arm, gripper) if self.units is None else self.units.back(arm, gripper)
+        if self.units is None:
+            return arm, gripper
+        openings, percents = self.units
+        order = np.argsort(percents)  # rising, as `interp` needs them
+        return np.radians(arm), float(np.interp(gripper, percents[order], openings[order]))
 
     def clip(self, action: NDArray[np.floating], step: int) -> F64:
         """Clip an action to the bounds.

@@ -65,42 +65,40 @@ class ModelFiles:
             UsageError: If a file cannot be read, the model has no joints, or `mend` names a text
                 that the file does not have.
         """
-        mujoco.set_mju_user_warning(_warn)
         try:
-            model = self._mended(checks.read_bytes(self.model, "an MJCF"))
-            home = self.includes or self.model.parent
-            name = str(home / f"mended {self.model.name}")
-            _read_included(model, home)  # here first, because MuJoCo would wait for a pipe
-            spec = mujoco.MjSpec.from_file(name, include={name: model})
-            if self.meshes is not None:
-                # MuJoCo prefixes names in an included file with its folder
-                for mesh in spec.meshes:
-                    mesh.file = mesh.file.removeprefix(spec.modelfiledir)
-                names = sorted({mesh.file for mesh in spec.meshes if mesh.file})
-                spec.assets = {
-                    mesh: checks.read_bytes(self.meshes / mesh, "a mesh") for mesh in names
-                }
-                spec.meshdir = spec.modelfiledir = ""
-            if not spec.joints:
-                raise ManipError(f"{self.model} has no joints{FRAGMENT}")
+            return _parsed(self).copy()  # which does not repeat the warnings at every compilation
         except (ManipError, ValueError) as error:
-            why = " ".join(str(error).split()) + FRAGMENT * ("XML model type" in str(error))
+            why = checks.one_line(error) + FRAGMENT * ("XML model type" in str(error))
             named = "" if str(self.model) in why else f"cannot read {self.model}: "
             raise UsageError(f"robot {robot}: {named}{why}") from None
-        return spec.copy()  # which does not repeat the warnings at every compilation
 
-    def _mended(self, model: bytes) -> bytes:
-        if not self.mend:
-            return model
-        text = model.decode()
-        for old, new in self.mend.items():
-            if old not in text:
-                raise ManipError(
-                    f"{self.model} has no {checks.shorten(old)} for mend to replace (included files"
-                    " are not changed)"
-                )
-            text = text.replace(old, new)
-        return text.encode()
+
+@cache
+def _parsed(files: ModelFiles) -> mujoco.MjSpec:
+    """The model, which a process reads once, as it does the robot's YAML."""
+    mujoco.set_mju_user_warning(_warn)
+    model = checks.read_bytes(files.model, "an MJCF")
+    for old, new in files.mend.items():
+        if old.encode() not in model:
+            raise ManipError(
+                f"{files.model} has no {checks.shorten(old)} for mend to replace (included files"
+                " are not changed)"
+            )
+        model = model.replace(old.encode(), new.encode())
+    home = files.includes or files.model.parent
+    name = str(home / f"mended {files.model.name}")
+    _read_included(model, home)  # here first, because MuJoCo would wait for a pipe
+    spec = mujoco.MjSpec.from_file(name, include={name: model})
+    if files.meshes is not None:
+        # MuJoCo prefixes names in an included file with its folder
+        for mesh in spec.meshes:
+            mesh.file = mesh.file.removeprefix(spec.modelfiledir)
+        names = {mesh.file for mesh in spec.meshes if mesh.file}
+        spec.assets = {mesh: checks.read_bytes(files.meshes / mesh, "a mesh") for mesh in names}
+        spec.meshdir = spec.modelfiledir = ""
+    if not spec.joints:
+        raise ManipError(f"{files.model} has no joints{FRAGMENT}")
+    return spec
 
 
 def _read_included(model: bytes, home: Path) -> None:

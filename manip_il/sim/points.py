@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.sim.world import SCENES_KEPT, Scene, World
+from manip_il.sim.scene import SCENES_KEPT
+from manip_il.sim.world import Scene, World
 
 _SIGNS = np.array(list(product((-1, 1), repeat=3)))  # signs of a box's corners
 _NAMED = (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_SITE)

@@ -51,10 +51,8 @@ class Prop(NamedTuple):
 
     def add_to(self, scene: Any) -> None:
         """Add the object to `scene`, MuJoCo's list of geoms to draw next."""
-        geom, colour = scene.geoms[scene.ngeom], np.array(self.colour, np.float32)
-        mujoco.mjv_initGeom(
-            geom, self.kind, self.size, self.position, self.rotation.ravel(), colour
-        )
+        geom, (*shape, rotation, colour) = scene.geoms[scene.ngeom], self
+        mujoco.mjv_initGeom(geom, *shape, rotation.ravel(), np.array(colour, np.float32))
         geom.category = mujoco.mjtCatBit.mjCAT_STATIC
         scene.ngeom += 1
 
@@ -86,17 +84,15 @@ def _stand(scene: Scene, data: mujoco.MjData) -> list[Prop]:
         default=_GOAL * scale,
     )
     if z <= _SHORTEST:
-        return [_cylinder((x, y, _THIN / 2), _UP, _FOOT * largest, _THIN)]
-    pole = _cylinder((x, y, z / 2), _UP, _POLE * scale, z)
+        parts = [(_FOOT * largest, _THIN, _THIN / 2, _UP)]
+    else:
+        arms = [(_POLE * scale, 2 * _ARM * largest, z, along) for along in _ACROSS]
+        parts = [(_POLE * scale, z, z / 2, _UP), *arms]
+    kind = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
     return [
-        pole,
-        *(_cylinder((x, y, z), along, _POLE * scale, 2 * _ARM * largest) for along in _ACROSS),
+        Prop(kind, np.array([radius, length / 2, 0.0]), np.array([x, y, up]), rotation, _STAND)
+        for radius, length, up, rotation in parts
     ]
-
-
-def _cylinder(at: tuple[float, float, float], rotation: F64, radius: float, length: float) -> Prop:
-    size = np.array([radius, length / 2, 0.0])
-    return Prop(int(mujoco.mjtGeom.mjGEOM_CYLINDER), size, np.array(at), rotation, _STAND)
 
 
 def _clutter(scene: Scene, data: mujoco.MjData, count: int, seed: int) -> list[Prop]:
@@ -128,8 +124,8 @@ def _thing(rng: np.random.Generator, scene: Scene) -> tuple[Prop, float, float]:
         ((x, z, 0.0), x, z),
         ((x, 0.0, 0.0), x, x),
     )[number]
-    yaw, colour = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.95, 3)
-    prop = Prop(int(_KINDS[number]), np.array(size), np.zeros(3), turn_about_z(yaw), (*colour, 1.0))
+    rotation, colour = turn_about_z(rng.uniform(-np.pi, np.pi)), rng.uniform(0.05, 0.95, 3)
+    prop = Prop(int(_KINDS[number]), np.array(size), np.zeros(3), rotation, (*colour, 1.0))
     return prop, radius, height
 
 

@@ -36,7 +36,12 @@ _AXES = 0.06, 0.006  # length and thickness of the axes drawn at `ee` [m]
 
 
 def pictures(
-    scene: Scene, data: mujoco.MjData, cameras: CameraConfig, variation: F64 | None = None
+    scene: Scene,
+    data: mujoco.MjData,
+    cameras: CameraConfig,
+    variation: F64 | None = None,
+    *,
+    axes: bool = False,
 ) -> dict[str, Picture]:
     """Return what every camera sees of the physics.
 
@@ -47,6 +52,7 @@ def pictures(
         data: Its data.
         cameras: The cameras, and the size and look of their pictures.
         variation: The world's variation, (v,); by default the scene's own.
+        axes: Whether to draw the axes of `ee`: x red, y green, z blue.
 
     Returns:
         Camera name -> RGB picture, uint8 (height, width, 3).
@@ -56,7 +62,7 @@ def pictures(
     """
     renderer = _renderer(scene, cameras.look)
     renderer.pose(data, scene.nominal if variation is None else variation)
-    return {name: renderer.picture(name, cameras.size) for name in cameras.names}
+    return {name: renderer.picture(name, cameras.size, axes=axes) for name in cameras.names}
 
 
 def projections(scene: Scene, cameras: CameraConfig, points: F64) -> dict[str, F32]:
@@ -79,31 +85,6 @@ def projections(scene: Scene, cameras: CameraConfig, points: F64) -> dict[str, F
         name: renderer.project(name, points, cameras.width / cameras.height)
         for name in cameras.names
     }
-
-
-def framed_picture(
-    scene: Scene, data: mujoco.MjData, camera: str, size: tuple[int, int], look: Look
-) -> Picture:
-    """Return what a camera sees of the physics, with the axes of `ee` drawn in.
-
-    The x axis is red, y green, z blue.
-
-    Args:
-        scene: The scene.
-        data: Its data.
-        camera: Name of the camera.
-        size: Height and width of the picture [pixels].
-        look: Lighting of the picture.
-
-    Returns:
-        The RGB picture, uint8 (height, width, 3).
-
-    Raises:
-        RenderError: If there is no off-screen OpenGL.
-    """
-    renderer = _renderer(scene, look)
-    renderer.pose(data, scene.nominal)
-    return renderer.picture(camera, size, axes=True)
 
 
 def close() -> None:
@@ -177,17 +158,15 @@ class _Renderer:
         mujoco.mj_camlight(self._model, self._data)
         self._props = props(self._of, self._data, part(variation, "clutter"))
 
-    def picture(self, camera: str, size: tuple[int, int], *, axes: bool = False) -> Picture:
+    def picture(self, camera: str, size: tuple[int, int], *, axes: bool) -> Picture:
         height, width = (_FINER * side for side in size)
-        have = self._context.offHeight, self._context.offWidth
-        if height > have[0] or width > have[1]:  # pictures of all sizes share one buffer
-            mujoco.mjr_resizeOffscreen(max(width, have[1]), max(height, have[0]), self._context)
+        most_wide, most_high = self._context.offWidth, self._context.offHeight
+        if height > most_high or width > most_wide:  # pictures of all sizes share one buffer
+            mujoco.mjr_resizeOffscreen(max(width, most_wide), max(height, most_high), self._context)
         self._camera.fixedcamid = self._cameras[camera]
-        everything, frame = mujoco.mjtCatBit.mjCAT_ALL, mujoco.mjtFrame
-        self._option.frame, self._option.sitegroup[_EE] = (
-            (frame.mjFRAME_SITE if axes else frame.mjFRAME_NONE),
-            axes,
-        )
+        self._option.sitegroup[_EE] = axes
+        frame, everything = mujoco.mjtFrame, mujoco.mjtCatBit.mjCAT_ALL
+        self._option.frame = frame.mjFRAME_SITE if axes else frame.mjFRAME_NONE
         mujoco.mjv_updateScene(
             self._model, self._data, self._option, None, self._camera, everything, self._scene
         )

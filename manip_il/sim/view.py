@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from manip_il.mdp import F64
 from manip_il.robots.geometry import turn_about_z
 from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.scene import TABLE, camera_id
+from manip_il.sim.scene import SCENES_KEPT, TABLE, Scene, camera_id
 from manip_il.sim.variation import part, seen_objects
-from manip_il.sim.world import SCENES_KEPT, Scene
 
 Indices = NDArray[np.integer]
 _CELLS = 22  # grid cells along a mesh's diagonal: enough to look right at 480 x 640 pixels
@@ -36,17 +35,7 @@ _LAMPS = tuple(
     for lamp in ("light_", "vis.headlight.")
     for colour in ("ambient", "diffuse", "specular")
 )
-_CHANGED = (
-    "geom_type",
-    "geom_size",
-    "geom_matid",
-    "geom_rgba",
-    "cam_pos",
-    "cam_quat",
-    "light_pos",
-    "light_dir",
-    *_LAMPS,
-)
+_MOVED = ("cam_pos", "cam_quat", "light_pos", "light_dir")
 
 
 class ViewModel:
@@ -64,14 +53,16 @@ class ViewModel:
             look: Lighting.
             fine: Whether to keep every face of the meshes.
         """
-        self.model: Any = copy.copy(scene.model if fine else _with_few_faces(scene))
-        self.model.vis.quality.offsamples = 0  # the renderer smooths edges itself
+        model: Any = copy.copy(scene.model if fine else _with_few_faces(scene))
+        model.vis.quality.offsamples = 0  # the renderer smooths edges itself
         if not look.shadows:
-            self.model.vis.quality.shadowsize = 0
+            model.vis.quality.shadowsize = 0
+        self.model = model
         self._objects = [one.geom for one in scene.objects.values()]
-        self._table = [self.model.geom(TABLE).id]
+        self._lamps = attrgetter(*_LAMPS)(model)
         self._light(look.brightness, look.light_turn)
-        self._plain = {name: attrgetter(name)(self.model).copy() for name in _CHANGED}
+        changed = attrgetter("geom_type", "geom_size", "geom_matid", "geom_rgba", *_MOVED)(model)
+        self._plain = [(array, array.copy()) for array in (*changed, *self._lamps)]
         self._applied = scene.nominal
 
     def apply(self, variation: F64) -> None:
@@ -84,22 +75,21 @@ class ViewModel:
         """
         if np.array_equal(variation, self._applied):
             return
-        for name, plain in self._plain.items():
-            attrgetter(name)(self.model)[:] = plain
+        for array, plain in self._plain:
+            array[:] = plain
         sizes, kind = seen_objects(variation)
         self.model.geom_size[self._objects] = sizes
         if kind is not None:
             self.model.geom_type[self._objects] = kind
         self._paint(self._objects, part(variation, "colour"))
-        self._paint(self._table, part(variation, "table"))
+        self._paint([self.model.geom(TABLE).id], part(variation, "table"))
         shifts, turns = (
             part(variation, name).reshape(-1, 3) for name in ("camera_shift", "camera_turn")
         )
         for moved in zip(CAMERAS, shifts, turns, strict=True):
             self._move_camera(*moved)
-        self._light(
-            float(part(variation, "brightness")[0]), float(part(variation, "light_turn")[0])
-        )
+        brightness, light_turn = part(variation, "brightness"), part(variation, "light_turn")
+        self._light(*brightness.tolist(), *light_turn.tolist())
         self._applied = variation.copy()
 
     def _paint(self, geoms: Sequence[int], colour: F64) -> None:
@@ -119,8 +109,8 @@ class ViewModel:
         """Multiply every lamp by a factor, and turn those fixed in the world about the vertical
         [deg].
         """
-        for name in _LAMPS:
-            attrgetter(name)(self.model)[:] *= brightness
+        for colour in self._lamps:
+            colour *= brightness
         rotation = turn_about_z(np.deg2rad(light_turn))
         in_world = self.model.light_bodyid == 0
         for vectors in (self.model.light_pos, self.model.light_dir):

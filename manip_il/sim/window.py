@@ -18,8 +18,9 @@ import numpy as np
 from manip_il.errors import RenderError
 from manip_il.mdp import F64
 from manip_il.sim.config import FILM
+from manip_il.sim.scene import STATE_KIND
 from manip_il.sim.view import ViewModel
-from manip_il.sim.world import STATE_KIND, Scene
+from manip_il.sim.world import Scene
 
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of X11 and Wayland
 # initial camera: target's height [m], [m], [deg]

@@ -114,18 +114,6 @@ def test_the_cube_is_touched_by_all_fingers_or_not_at_all(
         assert with_cube(robot, opening, offset).touched(OBJECT) == touched
 
 
-@given(
-    st.sampled_from(sorted(ROBOTS)),
-    st.floats(-0.008, 0.008),
-    st.floats(-0.008, 0.008),
-    st.floats(0.005, 0.02),
-)
-def test_what_no_finger_is_near_is_never_touched(robot: str, x: float, z: float, beside: float):
-    # The distance of two boxes that stand apart is now and then said to be none.
-    room = world_of(robot).gripper.most - EDGE
-    assert not with_cube(robot, EDGE + min(room, 2 * beside), (x, 0, z)).touched(OBJECT)
-
-
 @every_robot
 def test_the_lowest_hand_keeps_its_fingers_off_the_table(robot: str):
     world = world_of(robot)
