@@ -42,7 +42,10 @@ def stream_base(stream: str, seed: int = 0) -> int:
     """
     if not 0 <= seed <= MAX_SEED:
         raise UsageError(f"seed is {seed}; expected a whole number from 0 to {MAX_SEED}")
-    return (seed * _BLOCKS_PER_SEED + _block(stream)) * BLOCK
+    kind, _, number = stream.partition("/")
+    is_round = kind == "round" and int(number) < MAX_ROUNDS
+    block = _FIRST_ROUND + int(number) if is_round else _STREAMS[stream]
+    return (seed * _BLOCKS_PER_SEED + block) * BLOCK
 
 
 def stream_seeds(stream: str, count: int, seed: int = 0) -> range:
@@ -70,10 +73,3 @@ def rng_for(seed: int, purpose: str, *step: int) -> np.random.Generator:
     depend on the steps that the environment has made before: a restored state has the same future.
     """
     return np.random.default_rng([seed, zlib.crc32(purpose.encode()), *step])
-
-
-def _block(stream: str) -> int:
-    kind, _, number = stream.partition("/")
-    if kind == "round" and int(number) < MAX_ROUNDS:
-        return _FIRST_ROUND + int(number)
-    return _STREAMS[stream]

@@ -196,7 +196,10 @@ def find_home(robot: Robot, turns: bool) -> Robot:
     Raises:
         UsageError: If inverse kinematics converges from none of forty random postures.
     """
-    halves = (robot, replace(robot, ee=_half_turned(robot.ee))) if turns else (robot,)
+    halves, turned = [robot], np.empty(4)
+    if turns:
+        mujoco.mju_mulQuat(turned, np.array(robot.ee.quaternion), np.eye(4)[3])
+        halves.append(replace(robot, ee=replace(robot.ee, quaternion=_rounded(turned, _TURN))))
     highest = min(_HIGHEST, robot.workspace.height / 2)
     for share in _LOWER:
         worth, found = max(
@@ -226,12 +229,6 @@ def _stance(robot: Robot) -> str:
     return f"; {stands}: try base: {list(_rounded(base, 2))}"
 
 
-def _half_turned(ee: EndEffector) -> EndEffector:
-    turned = np.empty(4)
-    mujoco.mju_mulQuat(turned, np.array(ee.quaternion), np.array([0.0, 0.0, 0.0, 1.0]))
-    return replace(ee, quaternion=_rounded(turned, _TURN))
-
-
 def _rounded(values: F64, digits: int) -> Any:
     return tuple(round(float(value), digits) for value in values)
 
@@ -240,35 +237,26 @@ def _best(robot: Robot, height: float) -> tuple[float, Robot]:
     """The best posture's rating, minus infinity if there is none, and the robot with that
     posture as `home`.
     """
-    middle = replace(robot, home=tuple(_search_limits(ArmIK(robot)).mean(axis=1)))
+    own = ArmIK(robot).limits
+    # of a joint without limits or with a range of a turn or more: a turn
+    limits = np.where(np.ptp(own, axis=1, keepdims=True) < 2 * np.pi - 1e-3, own, [-np.pi, np.pi])
+    middle = replace(robot, home=tuple(limits.mean(axis=1)))
     ik, body = ArmIK(middle), Body(middle)
-    limits = _search_limits(ik)
     rng = np.random.default_rng(0)
     best = -math.inf, robot
     target = np.array([*robot.workspace.centre, height])
     rotation = hand_down(ik.ahead(target))
     for _ in range(_STARTS):
         q, miss = _descend(ik, rng.uniform(*limits.T), target, rotation, robot.leans)
+        q = np.where(limits[:, 0] == -np.pi, (q + np.pi) % (2 * np.pi) - np.pi, q)
+        q = np.clip(q, *own.T)
         if miss < _ARRIVED:
             margin = float(np.minimum(q - limits[:, 0], limits[:, 1] - q).min())
-            parts = (margin, ik.smallest_singular_value(q), ik.lowest_link(q))
-            worth = sum(
-                min(1.0, part / enough) for part, enough in zip(parts, _ENOUGH, strict=True)
-            )
-            worth -= len(body.meeting(q))
+            parts = np.array([margin, ik.smallest_singular_value(q), ik.lowest_link(q)])
+            worth = float(np.minimum(1.0, parts / _ENOUGH).sum()) - len(body.meeting(q))
             if worth > best[0]:
                 best = worth, replace(robot, home=_rounded(q, _DIGITS))
     return best
-
-
-def _search_limits(ik: ArmIK) -> F64:
-    """Limits of joints, (arm, 2) [rad].
-
-    -pi and pi for a joint without limits or with a range of a turn or more.
-    """
-    low, high = ik.limits.T
-    free = ~(high - low < 2 * np.pi - 1e-3)
-    return np.where(free[:, None], [-np.pi, np.pi], ik.limits)
 
 
 def _descend(ik: ArmIK, q: F64, target: F64, rotation: F64, soft: bool) -> tuple[F64, float]:
@@ -283,6 +271,4 @@ def _descend(ik: ArmIK, q: F64, target: F64, rotation: F64, soft: bool) -> tuple
         if dq is None or np.abs(dq).max() < 1e-4:
             break
         q = q + dq
-    free = _search_limits(ik)[:, 0] == -np.pi
-    q = np.where(free, (q + np.pi) % (2 * np.pi) - np.pi, q)
-    return np.clip(q, *ik.limits.T), miss
+    return q, miss

@@ -2,9 +2,9 @@
 fingers, and a workspace.
 """
 
-import itertools
 import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -141,36 +141,32 @@ def _ends(
         if not names.isdisjoint(joint.name for joint in jaw.find_all("joint"))
     ]
     bodies = moving if len(moving) > 1 else [palm.name, *moving]
-    ranges = [tuple(joint_range(joint).tolist()) for joint in driven]
+    ranges = [joint_range(joint).tolist() for joint in driven]
+    middle = [sum(ends) / 2 for ends in ranges]
     model = spec.compile()
     data, fingers = mujoco.MjData(model), finger_geoms(model, bodies)
     opposed = [[one, *(other for other in fingers if other is not one)] for one in fingers]
+    q = [model.joint(joint.name).qposadr[0] for joint in driven]
 
-    def gap(values: Sequence[float]) -> float:
-        for joint, value in zip(driven, values, strict=True):
-            data.joint(joint.name).qpos[0] = value
+    def gap(place: int, end: float) -> float:
+        data.qpos[q] = [*middle[:place], end, *middle[place + 1 :]]
         mujoco.mj_kinematics(model, data)
         ends = np.array([nearest(model, data, groups)[1] for groups in opposed])
         centres = np.array([np.mean(data.geom_xpos[list(finger)], axis=0) for finger in fingers])
         apart = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean()
         return float(apart + np.linalg.norm(centres - centres.mean(axis=0), axis=1).sum())
 
-    middle = [sum(ends) / 2 for ends in ranges]
-    closed, opened = list[float](), list[float]()
-    for place, ends in enumerate(ranges):
-        before, after = middle[:place], middle[place + 1 :]
-        near, far = sorted(
-            ends, key=lambda end, before=before, after=after: gap([*before, end, *after])
-        )
-        closed.append(near)
-        opened.append(far)
-    gap(closed)
+    sides = [sorted(ends, key=partial(gap, place)) for place, ends in enumerate(ranges)]
     if len(moving) > 1:
+        data.qpos[q] = [closed for closed, _ in sides]
+        mujoco.mj_kinematics(model, data)
         bodies = [
             model.body(model.geom_bodyid[pad]).name for pad in nearest(model, data, fingers)[0]
         ]
     # no -0
-    closed, opened = ([float(f"{end:.5g}") + 0.0 for end in ends] for ends in (closed, opened))
+    closed, opened = (
+        [float(f"{end:.5g}") + 0.0 for end in ends] for ends in zip(*sides, strict=True)
+    )
     return {
         "joints": [joint.name for joint in driven],
         "closed": closed,
@@ -191,8 +187,7 @@ def _workspace(model: mujoco.MjModel, hand: str) -> dict[str, Any]:
         first = int(model.body_jntadr[body])
         places += list(data.xanchor[first : first + int(model.body_jntnum[body])])
         body = int(model.body_parentid[body])
-    steps = [float(np.linalg.norm(a - b)) for a, b in itertools.pairwise(places)]
-    length = sum(steps[:-1])
+    length = float(np.linalg.norm(np.diff(places[:-1], axis=0), axis=1).sum())
     x, y, _ = places[-1].tolist()
     return {
         "centre": [_to_centimetres(x + _REACHES * length), _to_centimetres(y)],

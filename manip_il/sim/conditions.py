@@ -76,11 +76,6 @@ class Quantity(NamedTuple):
     places: Sequence[int] | I64 = range(0)
     nominal: float = 0.0
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether the ends of its range are whole numbers."""
-        return self.draw in (_whole, _whole_and_seed)
-
 
 # Place 0 of the world's part of a variation is the shape's. The camera at the side got its places
 # after the others.
@@ -275,7 +270,8 @@ def _range(condition: str, name: str, given: Any) -> Range:
     """A range as a tuple, from what Python or YAML gives: a pair or a number."""
     if name not in RANGES:
         raise UnknownName(f"key in {condition}:", name[: checks.LONGEST_NAME], RANGES)
-    (least, most), is_whole = RANGES[name].bounds, RANGES[name].is_whole
+    least, most = RANGES[name].bounds
+    is_whole = RANGES[name].draw in (_whole, _whole_and_seed)
     try:
         low, high = given if isinstance(given, list | tuple) else (given, given)
         low = checks.number(name, low, least, most)

@@ -110,7 +110,18 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             for end in (self.scene.actions.low, self.scene.actions.high)
         )
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
-        self.observation_space = self._observation_space()
+        sizes = {
+            "agent_pos": len(robot.joint_names),
+            "environment_state": len(environment_state_names(self.scene)),
+        }
+        spaces: dict[str, gymnasium.Space[Any]] = {
+            name: gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+            for name, size in sizes.items()
+        }
+        if cameras:
+            picture = gymnasium.spaces.Box(0, 255, (*cameras.size, 3), np.uint8)
+            spaces["pixels"] = gymnasium.spaces.Dict(dict.fromkeys(self.cameras, picture))
+        self.observation_space = gymnasium.spaces.Dict(spaces)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -368,17 +379,6 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         if self.cameras:
             observation["pixels"] = seen.images
         return observation
-
-    def _observation_space(self) -> gymnasium.spaces.Dict:
-        n, k = len(self.scene.robot.joint_names), len(environment_state_names(self.scene))
-        spaces: dict[str, gymnasium.Space[Any]] = {
-            name: gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-            for name, size in (("agent_pos", n), ("environment_state", k))
-        }
-        if self._view:
-            picture = gymnasium.spaces.Box(0, 255, (*self._view.size, 3), np.uint8)
-            spaces["pixels"] = gymnasium.spaces.Dict(dict.fromkeys(self.cameras, picture))
-        return gymnasium.spaces.Dict(spaces)
 
 
 def environment_state(world: World) -> F32:

@@ -150,9 +150,9 @@ def _rest(hull: ConvexHull, centre: F64, down: F64, lowest: float, widest: float
     flat, turns = (hull.points - centre) @ axes.T, _turns(hull, axes)
     deepest = max(lowest, tall - DEEPEST)
     for at in (max(deepest, min(height, tall / 2)), deepest):  # heights of the hand over the table
-        ways, any_yaw = _ways(
-            _all_ways(hull, heights + height, flat, at - lowest, turns), widest - LEAST_ROOM
-        )
+        levels = np.arange(at - lowest + _TIP, (heights + height).max() - _TIP / 2, _LEVEL)
+        cuts = [_cut(hull, heights + height, flat, level) for level in levels.tolist()]
+        ways, any_yaw = _ways([_way(cuts, turn) for turn in turns], widest - LEAST_ROOM)
         if min(way.slope for way in ways) <= _SLOPE:  # else it narrows upwards: grasp lower
             break
     turned = np.array([[math.cos(way.turn), math.sin(way.turn)] for way in ways])
@@ -171,13 +171,6 @@ def _rest(hull: ConvexHull, centre: F64, down: F64, lowest: float, widest: float
         fits=min(way.width for way in ways) <= widest - LEAST_ROOM and tall >= LEAST_HEIGHT,
         round=any_yaw,
     )
-
-
-def _all_ways(hull: ConvexHull, heights: F64, flat: F64, tips: float, turns: F64) -> list[_Way]:
-    """The grasp at each turn, with the fingertips at the height `tips` over the table [m]."""
-    levels = np.arange(tips + _TIP, heights.max() - _TIP / 2, _LEVEL).tolist()
-    cuts = [_cut(hull, heights, flat, level) for level in levels]
-    return [_way(cuts, turn) for turn in turns]
 
 
 def _cut(hull: ConvexHull, heights: F64, flat: F64, level: float) -> F64:

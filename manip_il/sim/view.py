@@ -86,8 +86,12 @@ class ViewModel:
         shifts, turns = (
             part(variation, name).reshape(-1, 3) for name in ("camera_shift", "camera_turn")
         )
-        for moved in zip(CAMERAS, shifts, turns, strict=True):
-            self._move_camera(*moved)
+        for name, shift, turn in zip(CAMERAS, shifts, np.deg2rad(turns), strict=True):
+            camera, moved = camera_id(self.model, name), np.empty(3)
+            quat = self.model.cam_quat[camera]
+            mujoco.mju_rotVecQuat(moved, shift, quat)
+            self.model.cam_pos[camera] += moved
+            mujoco.mju_quatIntegrate(quat, turn, 1.0)
         brightness, light_turn = part(variation, "brightness"), part(variation, "light_turn")
         self._light(*brightness.tolist(), *light_turn.tolist())
         self._applied = variation.copy()
@@ -96,14 +100,6 @@ class ViewModel:
         if (colour >= 0).all():
             self.model.geom_matid[geoms] = -1  # a material's colour would hide the geom's
             self.model.geom_rgba[geoms] = [*colour, 1.0]
-
-    def _move_camera(self, name: str, shift: F64, turn: F64) -> None:
-        """Move a camera [m], and turn it [deg], in its own frame."""
-        camera = camera_id(self.model, name)
-        quat, moved = self.model.cam_quat[camera], np.empty(3)
-        mujoco.mju_rotVecQuat(moved, shift, quat)
-        self.model.cam_pos[camera] += moved
-        mujoco.mju_quatIntegrate(quat, np.deg2rad(turn), 1.0)
 
     def _light(self, brightness: float, light_turn: float) -> None:
         """Multiply every lamp by a factor, and turn those fixed in the world about the vertical
@@ -131,28 +127,24 @@ def simplify_meshes(model: mujoco.MjModel, finest: float) -> None:
         model: The model, changed in place.
         finest: Least size of a grid cell [m].
     """
-    for mesh in range(model.nmesh):
-        if model.mesh_facenum[mesh] > _PLAIN_FACES:
-            _simplify(model, mesh, finest)
-
-
-def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
-    """Overwrite the start of a mesh's vertices, normals and faces with fewer.
-
-    The rest is never drawn.
-    """
-    vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
-    normals = model.mesh_normal[model.mesh_normaladr[mesh] :][: model.mesh_normalnum[mesh]]
-    faces, face_normals = (
-        rows[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]]
-        for rows in (model.mesh_face, model.mesh_facenormal)
-    )
-    normal_of = np.zeros(len(vertices), dtype=np.int64)
-    normal_of[faces] = face_normals
-    positions, originals, few = cluster(vertices.astype(np.float64), faces, finest)
-    vertices[: len(positions)], normals[: len(positions)] = positions, normals[normal_of[originals]]
-    faces[: len(few)] = face_normals[: len(few)] = few
-    model.mesh_facenum[mesh] = len(few)
+    for mesh in np.flatnonzero(model.mesh_facenum > _PLAIN_FACES):
+        vertices, normals, faces, face_normals = (
+            getattr(model, f"mesh_{rows}")[start:][:count]
+            for rows, start, count in (
+                ("vert", model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]),
+                ("normal", model.mesh_normaladr[mesh], model.mesh_normalnum[mesh]),
+                ("face", model.mesh_faceadr[mesh], model.mesh_facenum[mesh]),
+                ("facenormal", model.mesh_faceadr[mesh], model.mesh_facenum[mesh]),
+            )
+        )
+        normal_of = np.zeros(len(vertices), dtype=np.int64)
+        normal_of[faces] = face_normals
+        positions, originals, few = cluster(vertices.astype(np.float64), faces, finest)
+        # Their start is overwritten; the rest is never drawn.
+        vertices[: len(positions)] = positions
+        normals[: len(positions)] = normals[normal_of[originals]]
+        faces[: len(few)] = face_normals[: len(few)] = few
+        model.mesh_facenum[mesh] = len(few)
 
 
 def cluster(
@@ -182,7 +174,11 @@ def cluster(
     moves *= size / np.maximum(np.linalg.norm(moves, axis=1, keepdims=True), size)
     by_distance = np.lexsort([np.linalg.norm(vertices - means[cell], axis=1), cell])
     originals = by_distance[np.cumsum(counts) - counts]
-    return means + moves, originals, _distinct(cell[faces])
+    # faces with three different corners, each once, in their winding
+    merged = cell[faces]
+    merged = merged[(merged != np.roll(merged, 1, axis=1)).all(axis=1)]
+    turned = (merged.argmin(axis=1)[:, None] + [0, 1, 2]) % 3
+    return means + moves, originals, np.unique(np.take_along_axis(merged, turned, 1), axis=0)
 
 
 def _flattest(vertices: F64, faces: Indices, cell: Indices, means: F64) -> F64:
@@ -205,14 +201,6 @@ def _flattest(vertices: F64, faces: Indices, cell: Indices, means: F64) -> F64:
     return np.linalg.solve(
         matrix + pull[:, :, None] * np.eye(3), (right + pull * means)[:, :, None]
     )[:, :, 0]
-
-
-def _distinct(faces: Indices) -> Indices:
-    """The faces with three different corners, each once, in their winding."""
-    first, second, third = faces.T
-    faces = faces[(first != second) & (second != third) & (third != first)]
-    turned = (faces.argmin(axis=1)[:, None] + [0, 1, 2]) % 3
-    return np.unique(np.take_along_axis(faces, turned, axis=1), axis=0)
 
 
 def _sums(groups: Indices, values: F64, count: int) -> F64:
