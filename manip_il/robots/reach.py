@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from manip_il.checks import open_outside, without_link
 from manip_il.mdp import F64
 from manip_il.robots import HERE, ROBOTS
-from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import (
     CLEARANCE,
     Body,
@@ -33,7 +32,7 @@ from manip_il.robots.geometry import (
     hand_down,
     off_yaw,
 )
-from manip_il.robots.robot import Robot
+from manip_il.robots.robot import ModelFiles, Robot
 from manip_il.robots.spec import arm_spec, model_bytes
 from manip_il.robots.table import get_robot
 

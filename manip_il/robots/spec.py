@@ -12,8 +12,7 @@ import numpy as np
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.mdp import F64
-from manip_il.robots.files import ModelFiles
-from manip_il.robots.robot import GRIPPER, GripperConfig, Robot
+from manip_il.robots.robot import GRIPPER, GripperConfig, ModelFiles, Robot
 
 # defaults for what we add to a model, because its own defaults may set a material or a range
 PLAIN = mujoco.MjSpec()

@@ -2,10 +2,9 @@
 
 An episode's seed alone decides its values.
 
-The drawn values are applied to the model by `variation.py`, to pictures by `view.py`, to what a
-policy observes by `env.py`, and during the episode by `events.py`.
-
-What an episode's condition can vary: one table of bounds, draws, and places in a state's variation.
+`RANGES` is the one table of what can vary: bounds, draws, and places in a state's variation. The
+drawn values are applied to the model by `variation.py`, to pictures by `view.py`, to what a policy
+observes by `env.py`, and during the episode by `events.py`.
 """
 
 from __future__ import annotations

@@ -20,8 +20,7 @@ from manip_il.seeding import rng_for
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CAMERAS, CameraConfig, Episodes, Look, require_cameras
 from manip_il.sim.events import Events, draw_posture
-from manip_il.sim.points import points_in
-from manip_il.sim.render import Picture, pictures, projections
+from manip_il.sim.render import Picture, pictures, points_in, projections
 from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.shape import ANY
 from manip_il.sim.task import Task
