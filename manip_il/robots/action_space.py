@@ -1,25 +1,13 @@
 """Meaning of a robot's action, number by number."""
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import MismatchError, NotFiniteError
 from manip_il.mdp import F64
-
-
-class ServoUnits(NamedTuple):
-    """A gripper in the units of a robot with servos, whose joints are in degrees.
-
-    Attributes:
-        openings: Gripper openings [m], rising, (c,).
-        percents: Positions of the gripper's servo at these, 0 to 100, (c,).
-    """
-
-    openings: F64
-    percents: F64
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +23,9 @@ class ActionSpace:
             gripper, the range of its opening [m]; (n,).
         relative: Whether a learner's target is relative to the measured position, (n,); true except
             for the gripper.
-        units: Set for a robot with servos; `low`, `high`, `scale`, actions and measured states are
-            then in degrees, the gripper's from 0 to 100.
+        units: Set for a robot with servos: openings of its gripper [m], rising, (c,), and positions
+            of the gripper's servo at these, (c,). `low`, `high`, `scale`, actions and measured
+            states are then in degrees, the gripper's from 0 to 100.
     """
 
     names: tuple[str, ...]
@@ -44,7 +33,7 @@ class ActionSpace:
     high: F64
     scale: F64
     relative: NDArray[np.bool_]
-    units: ServoUnits | None = None
+    units: tuple[F64, F64] | None = None
     arm: ClassVar[slice] = slice(-1)  # places of the joints in an action
     gripper: ClassVar[int] = -1  # place of the gripper's opening
 

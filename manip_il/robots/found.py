@@ -259,7 +259,7 @@ def _best(robot: Robot, height: float) -> tuple[float, Robot]:
         q = np.clip(q, *own.T)
         if miss < _ARRIVED:
             margin = float(np.minimum(q - limits[:, 0], limits[:, 1] - q).min())
-            parts = np.array([margin, ik.smallest_singular_value(q), ik.lowest_link(q)])
+            parts = np.array([margin, *ik.freedom(q)])
             worth = float(np.minimum(1.0, parts / _ENOUGH).sum()) - len(body.meeting(q))
             if worth > best[0]:
                 best = worth, replace(robot, home=_rounded(q, _DIGITS))

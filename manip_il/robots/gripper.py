@@ -9,8 +9,8 @@ linked fingers are thus treated alike.
 import bisect
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -33,8 +33,7 @@ _LOPSIDED = 0.004
 _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 
-@dataclass(frozen=True, eq=False)
-class Sweep:
+class Sweep(NamedTuple):
     """Measured relation between command and opening, at c commands.
 
     Attributes:

@@ -4,8 +4,7 @@ Functions that change the world do so in place, and draw from the generator that
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -27,8 +26,7 @@ _MAX_DRAWS = 100
 _OVERLAP = -0.004  # contact distance below which a moved object overlaps something [m]
 
 
-@dataclass(frozen=True)
-class Kind:
+class Kind(NamedTuple):
     """One entry of `KINDS`: a change of the world (`change`), or of one action (`wrong`)."""
 
     words: str

@@ -12,7 +12,7 @@ import numpy as np
 from manip_il.checks import one_line
 from manip_il.errors import UnknownName, UsageError
 from manip_il.mdp import I64
-from manip_il.robots.action_space import ActionSpace, ServoUnits
+from manip_il.robots.action_space import ActionSpace
 from manip_il.robots.geometry import angle_across, outline, yaw_ahead
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.robot import TABLE_BEYOND, CameraPose, Robot
@@ -240,9 +240,9 @@ def _action_space(robot: Robot, joints: list[Any], gripper: Gripper) -> ActionSp
     relative, units = np.arange(len(scale)) < len(joints), None
     if robot.lerobot is not None:
         openings, driven = gripper.driven
-        units = ServoUnits(openings, robot.lerobot.percent(driven))
+        units = openings, robot.lerobot.percent(driven)
         low, high, scale = np.degrees([low, high, scale])
-        low[-1], high[-1] = np.sort(units.percents[[0, -1]])
+        low[-1], high[-1] = np.sort(units[1][[0, -1]])
         scale[-1] = high[-1] - low[-1]
     return ActionSpace(robot.joint_names, low, high, scale, relative, units)
 

@@ -6,8 +6,7 @@ and units of `Condition`.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -38,8 +37,7 @@ for _quantity in RANGES.values():
 _NOT_PHYSICS = WORLD_SIZE - RANGES["posture"].places[0]
 
 
-@dataclass(frozen=True)
-class Object:
+class Object(NamedTuple):
     """A free body of a compiled model, and its first geom, which gives its shape.
 
     Attributes:

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -14,7 +13,6 @@ from manip_il.robots.reach import Reach
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_model, arm_spec
 from manip_il.robots.table import get_robot
-from manip_il.sim.scene import PREFIX
 from manip_il.worlds.ladder.world import scene_of
 from manip_il.worlds.table import env_fingerprint, make_config
 
@@ -115,29 +113,6 @@ def test_nothing_that_belongs_to_a_world_is_left_of_a_model(own: Robot):
     model = spec.compile()
     assert (model.opt.timestep, model.opt.gravity[2]) == (0.002, -9.81)
     assert [material.name for material in spec.materials] == ["steel"]
-
-
-@every_robot
-def test_a_scene_has_the_worlds_cameras_lamps_and_sky_alone(robot: str):
-    scene = scene_of(robot, "reach")
-    model = scene.model
-    assert sorted(model.camera(i).name for i in range(model.ncam)) == [
-        "front",
-        f"{PREFIX}wrist",
-        "side",
-    ]
-    assert all(model.light_bodyid == 0)
-    assert model.nsensor == model.nkey == 0
-    assert [model.body(i).name for i in range(model.nbody) if model.body_mocapid[i] >= 0] == [
-        "goal"
-    ]
-    skies = [
-        i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX
-    ]
-    assert [model.texture(i).name for i in skies] == ["sky"]
-    driven = {model.joint(int(model.actuator_trnid[i, 0])).name for i in range(model.nu)}
-    assert driven == {PREFIX + name for name in (*scene.robot.joints, *scene.robot.gripper.joints)}
-    assert model.nu == len(driven)
 
 
 @every_robot
