@@ -90,7 +90,7 @@ class Scene:
         self.hulls = {
             name: Hull(model, one.body, one.geom, robot.ee.lowest, self.gripper.most)
             for name, one in self.objects.items()
-            if model.geom_type[one.geom] == int(mujoco.mjtGeom.mjGEOM_MESH)
+            if model.geom_type[one.geom] == variation.MESH
         }
         roots = model.body_rootid[model.geom_bodyid]
         self.furniture: I64 = np.flatnonzero(model.body_mocapid[roots] >= 0)
@@ -217,9 +217,7 @@ def _check_objects(scene: Scene) -> None:
             )
         # width between the fingers if the object lies on its worst side
         elif kind in variation.KINDS:
-            width = float(
-                np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0]
-            )
+            width = float(np.sort(lengths)[1])
             fits = width < most
         else:
             raise UsageError(

@@ -23,7 +23,7 @@ GEOMS = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
 KINDS = {int(geom): kind for kind, geom in GEOMS.items()}
-_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 PER_OBJECT = 5
 _SIZE = slice(0, 3)
 _MASS = 3
@@ -177,7 +177,7 @@ def _apply_object(changed: Any, plain: Any, one: Object, row: F64, shape: int | 
     like, at = plain, geom
     bounds = plain.bvh_aabb[nodes, 3:]
     inertia = plain.body_inertia[body] * (mass / plain.body_mass[body])
-    if own != _MESH and (kind != own or not np.array_equal(size, plain.geom_size[geom])):
+    if own != MESH and (kind != own or not np.array_equal(size, plain.geom_size[geom])):
         spec = mujoco.MjSpec()  # a body of one geom, for its inertia and bounds
         spec.worldbody.add_body().add_geom(type=mujoco.mjtGeom(kind), size=size, mass=mass)
         like, at = spec.compile(), 0
