@@ -25,7 +25,7 @@ from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.shape import ANY
 from manip_il.sim.task import Task
 from manip_il.sim.variation import with_drawn
-from manip_il.sim.window import Window, require_display
+from manip_il.sim.view import Window, require_display
 from manip_il.sim.world import Scene, World
 
 _JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
@@ -45,8 +45,6 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     from before it do not arrive late after `set_state`.
 
     Attributes:
-        scene: The compiled scene, shared by all environments with the same robot, task and physics
-            step.
         world: The scene's physics.
         config: Length and control rate of the episodes, and when they count as solved.
         look: Lighting of pictures.
@@ -90,8 +88,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """
         self.look, self._view = look or (cameras.look if cameras else Look()), cameras
         self.config = config
-        self.scene = build_scene(robot, task, config.physics_step)
-        self.world, self._task = World(self.scene), self.scene.task
+        self.world = World(build_scene(robot, task, config.physics_step))
+        self._task = self.world.scene.task
         self._conditions: tuple[Condition, ...] = ()
         self._begin(0)  # nothing is drawn before an episode starts
         self._conditions = tuple(conditions)
@@ -146,6 +144,11 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def task_description(self) -> str:
         """Text of the episode for policies that read language."""
         return self._task.instruction_in(self.world)
+
+    @property
+    def scene(self) -> Scene:
+        """Compiled scene, shared by all environments with the same robot, task and physics step."""
+        return self.world.scene
 
     @property
     def data(self) -> mujoco.MjData:
