@@ -242,7 +242,8 @@ def _way(cuts: Sequence[F64], turn: float) -> _Way:
             met = p + shares.clip(0, 1) * (q - p)
             ends.append((met.min(), met.max()))
     low, high = np.array(ends).T
-    least, most, up = float(low.min()), float(high.max()), min(2, len(ends) - 1)
+    least, most = float(low.min()), float(high.max())
+    up = min(2, len(ends) - 1)
     rises = (low[up] - low[0]) * (low[0] == least), (high[0] - high[up]) * (high[0] == most)
     slope = max(0.0, float(max(rises) / max(up * _LEVEL, _LEVEL)))
     return _Way(turn, most - least, float(np.ptp(lengths)), (most + least) / 2, slope)
