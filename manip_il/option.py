@@ -104,7 +104,7 @@ def check_bounds(options: Any, prefix: str = "") -> None:
     """
     for one in fields(options):
         name, value = prefix + one.name, getattr(options, one.name)
-        kind: Any = Any
+        kind: Any = object
         with contextlib.suppress(NameError):  # a name that only type checkers import
             kind = type_of(type(options), one)
         if not _is_of(value, kind):
