@@ -70,7 +70,9 @@ class ModelFiles:
                 that the file does not have.
         """
         try:
-            return _parsed(self).copy()  # which does not repeat the warnings at every compilation
+            written = self.model.exists() and self.model.stat().st_mtime_ns
+            # a copy does not repeat the warnings at every compilation
+            return _parsed(self, written).copy()
         except (ManipError, ValueError) as error:
             why = checks.one_line(error) + FRAGMENT * ("XML model type" in str(error))
             named = "" if str(self.model) in why else f"cannot read {self.model}: "
@@ -78,8 +80,8 @@ class ModelFiles:
 
 
 @cache
-def _parsed(files: ModelFiles) -> mujoco.MjSpec:
-    """The model, which a process reads once, as it does the robot's YAML."""
+def _parsed(files: ModelFiles, written: int) -> mujoco.MjSpec:
+    """The model, read once until its file is `written` again."""
     mujoco.set_mju_user_warning(_warn)
     model = checks.read_bytes(files.model, "an MJCF")
     for old, new in files.mend.items():
