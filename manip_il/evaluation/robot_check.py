@@ -25,8 +25,8 @@ from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
-from manip_il.sim.config import CAMERAS, FILM
-from manip_il.sim.render import framed_picture
+from manip_il.sim.config import CAMERAS, FILM, CameraConfig
+from manip_il.sim.render import pictures
 from manip_il.sim.scene import PREFIX
 from manip_il.sim.world import Scene, World
 from manip_il.worlds.ladder.world import scene_of
@@ -325,8 +325,9 @@ def looks(name: NameOrPath) -> Figure:
     data = _at_home(scene)
     data.mocap_pos[:, 2] = -9.0  # move goals out of sight
     with drawing(len(CAMERAS), size=_VIEW) as (drawn, axes):
-        for axis, camera in zip(axes[0], CAMERAS, strict=True):
-            axis.imshow(framed_picture(scene, data, camera, (480, 640), FILM))
+        seen = pictures(scene, data, CameraConfig(CAMERAS, 480, 640, FILM), axes=True)
+        for axis, (camera, picture) in zip(axes[0], seen.items(), strict=True):
+            axis.imshow(picture)
             axis.set_title(f"camera {camera}")
             axis.axis("off")
         return to_figure(drawn, "The arm at home in its scene")

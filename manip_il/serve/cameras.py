@@ -15,7 +15,7 @@ from manip_il.serve.station import Station
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import Picture
-from manip_il.sim.window import Clock
+from manip_il.sim.view import Clock
 
 RATE = 30  # pictures per second
 _QUALITY = 90  # JPEG quality

@@ -2,10 +2,9 @@
 
 An episode's seed alone decides its values.
 
-The drawn values are applied to the model by `variation.py`, to pictures by `view.py`, to what a
-policy observes by `env.py`, and during the episode by `events.py`.
-
-What an episode's condition can vary: one table of bounds, draws, and places in a state's variation.
+`RANGES` is the one table of what can vary: bounds, draws, and places in a state's variation. The
+drawn values are applied to the model by `variation.py`, to pictures by `view.py`, to what a policy
+observes by `env.py`, and during the episode by `events.py`.
 """
 
 from __future__ import annotations
@@ -75,11 +74,6 @@ class Quantity(NamedTuple):
     draw: Callable[[np.random.Generator, Range], Any] = _number
     places: Sequence[int] | I64 = range(0)
     nominal: float = 0.0
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether the ends of its range are whole numbers."""
-        return self.draw in (_whole, _whole_and_seed)
 
 
 # Place 0 of the world's part of a variation is the shape's. The camera at the side got its places
@@ -186,7 +180,13 @@ class Condition:
             and (sizes or name != "size")
         }
         if "size" in kept and sizes is not None:
-            kept["size"] = _overlap(self.name, kept["size"], sizes)
+            (least, most), asked = sizes, kept["size"]
+            low, high = kept["size"] = max(asked[0], least), min(asked[1], most)
+            if low > high:
+                raise UsageError(
+                    f"{self.name}: size is {words(asked)} m, and the task takes objects of"
+                    f" {least:.3g} to {most:.3g} m; choose other sizes"
+                )
         if self.ranges and not kept:
             return None
         return Condition(self.name, **kept)
@@ -269,36 +269,20 @@ def _range(condition: str, name: str, given: Any) -> Range:
     """A range as a tuple, from what Python or YAML gives: a pair or a number."""
     if name not in RANGES:
         raise UnknownName(f"key in {condition}:", name[: checks.LONGEST_NAME], RANGES)
-    what, ends = (
-        f"{condition}: {name}",
-        given if isinstance(given, list | tuple) else (given, given),
-    )
+    least, most = RANGES[name].bounds
+    is_whole = RANGES[name].draw in (_whole, _whole_and_seed)
     try:
-        low, high = (checks.number(what, end) for end in ends)
+        low, high = given if isinstance(given, list | tuple) else (given, given)
+        low = checks.number(name, low, least, most)
+        high = checks.number(name, high, low, most)
+        if is_whole and (low % 1 or high % 1):
+            raise ValueError(given)
     except (ManipError, ValueError):
         raise UsageError(
-            f"{what} is {checks.shorten(given)}; expected a number, or [low, high]"
+            f"{condition}: {name} is {checks.shorten(given)}; expected a{' whole' * is_whole}"
+            f" number, or [low, high], from {least} to {most}"
         ) from None
-    least, most = RANGES[name].bounds
-    if not least <= low <= high <= most:
-        raise UsageError(
-            f"{what} is [{low}, {high}]; expected low <= high, both from {least} to {most}"
-        )
-    if RANGES[name].is_whole and (low % 1 or high % 1):
-        raise UsageError(f"{what} is [{low}, {high}]; expected whole numbers")
     return given if isinstance(given, tuple) else (low, high)
-
-
-def _overlap(name: str, asked: Range, sizes: Range) -> Range:
-    """The sizes that are both asked for and possible in a task."""
-    low, high = max(asked[0], sizes[0]), min(asked[1], sizes[1])
-    if low > high:
-        takes = f"{sizes[0]:.3g} to {sizes[1]:.3g} m"
-        raise UsageError(
-            f"{name}: size is {words(asked)} m, and the task takes objects of {takes}; choose other"
-            " sizes"
-        )
-    return low, high
 
 
 NOMINAL = Condition()

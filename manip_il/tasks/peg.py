@@ -19,8 +19,9 @@ from manip_il.robots.geometry import (
     turn_about_z,
 )
 from manip_il.robots.reach import ARRIVES, reach_of
+from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.task import Rung, Target
-from manip_il.sim.world import SCENES_KEPT, Scene, World
+from manip_il.sim.world import Scene, World
 from manip_il.tasks.grasp import OPEN_SLACK, is_inside, lie_of, once_per_state, share
 from manip_il.tasks.ladder import CLOSED, LiftProfile, nearness, rise_first
 

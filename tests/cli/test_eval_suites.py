@@ -90,7 +90,7 @@ def test_a_yaml_of_ones_own_is_a_suite(act, here, capsys, error):
         assert 0.4 <= episode.detail["drawn"]["mass"] <= 0.5
     capsys.readouterr()
     for text, what in (
-        ("mass: [0.5, 0.4]", "heavy: mass is [0.5, 0.4]; expected low <= high"),
+        ("mass: [0.5, 0.4]", "heavy: mass is [0.5, 0.4]; expected a number, or [low, high]"),
         ("mas: 1", "did you mean 'mass'?"),
         ("brightness: [0.5, 2]", "changes nothing for pick_place and a policy without cameras"),
     ):

@@ -120,9 +120,7 @@ MISTAKES = {
     "dagger --hold=-1": "hold is -1; expected at least 0",
     "dagger --policy.type=act --query=one": "use label=branch or label=takeover",
     "data check": "DATASET is missing",
-    "data render SAMPLE x --look.brightness=9": (
-        "brightness is 9.0; expected a factor from 0.1 to 2.0"
-    ),
+    "data render SAMPLE x --look.brightness=9": ("brightness is 9.0; expected 0.1 to 2"),
     "data redraw SAMPLE SAMPLE --overwrite=true": "overlaps",
     "push SAMPLE": "REMOTE is missing",
     "push missing hf://me/x": "missing does not exist; expected a dataset, a run or a policy",

@@ -3,7 +3,6 @@ fingerprint.
 """
 
 import copy
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +17,7 @@ from manip_il.data.schema import EXPERT_PHASE
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.events import STANDARD
+from manip_il.sim.scene import Scene
 from manip_il.sim.task import NO_PHASE, phases
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks import NAMES
@@ -177,7 +177,7 @@ def test_the_fingerprint_changes_with_the_model(change: str, monkeypatch):
     before = env_fingerprint(config)
     model = copy.copy(scene.model)
     getattr(model, change)[...] += 1e-6
-    monkeypatch.setattr(world, "config_scene", lambda _: replace(scene, model=model))
+    monkeypatch.setattr(world, "config_scene", lambda _: Scene(scene.robot, scene.task, model))
     after = world.WORLD.fingerprint(config)
     assert {key for key in before if before[key] != after[key]} == {"model_sha256"}
 

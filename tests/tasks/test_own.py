@@ -20,7 +20,7 @@ from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
 from manip_il.robots import table as robots
-from manip_il.sim.points import point_names
+from manip_il.sim.render import point_names
 from manip_il.tasks import table
 from manip_il.tasks.table import get_task
 from manip_il.worlds.ladder.world import scene_of

@@ -14,8 +14,8 @@ from manip_il.errors import ManipError
 from manip_il.evaluation import robot_check
 from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
 from manip_il.evaluation.robot_check import advice, check_robot, verdict
+from manip_il.robots.found import suggest, yaml_of
 from manip_il.robots.gripper import sweep
-from manip_il.robots.suggest import suggest, yaml_of
 from manip_il.robots.table import get_robot
 from manip_il.tasks import NAMES
 from manip_il.tasks.table import get_task

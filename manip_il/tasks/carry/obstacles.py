@@ -12,7 +12,8 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.geometry import outline
-from manip_il.sim.world import SCENES_KEPT, Scene, World
+from manip_il.sim.scene import SCENES_KEPT
+from manip_il.sim.world import Scene, World
 from manip_il.tasks.carry.layout import (
     DEFAULT,
     FEATURES,
