@@ -31,7 +31,7 @@ from manip_il.data import schema
 from manip_il.data.build import dataset_sha256
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
-from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import in_one_line
 from manip_il.learn.sources import check_same_sources
 from manip_il.mdp import F32, F64, I64, require_finite
@@ -44,9 +44,7 @@ _TRIES = 100  # attempts to draw a new pair
 FORMAT, VERSION = "manip_il pairs", 1
 _ROUNDS = "round_*/dataset"  # a run's datasets
 PREFERENCES = "manip_il preferences"  # format of an answers file
-ANSWERS = ("left", "right", "equal", "skip")
-LEFT, RIGHT, EQUAL, SKIP = ANSWERS
-BETTER = {LEFT: 1.0, RIGHT: 0.0, EQUAL: 0.5}  # probability that the left clip is better
+BETTER = {"left": 1.0, "right": 0.0, "equal": 0.5}  # probability that the left clip is better
 _ROUNDING = 1e-9  # returns that differ by less than this are equal
 
 
@@ -59,16 +57,15 @@ class Frames:
         inputs: Inputs of a reward, (N, n + k + n): state, environment state and the action as
             executed.
         episodes: Episode number of each frame, ascending, (N,).
-        progress: True progress at each frame, (N,); None if the dataset has no such column.
-        success: Whether the task is solved at each frame, (N,); None if the dataset has no such
-            column.
+        progress: True progress at each frame, (N,).
+        success: Whether the task is solved at each frame, (N,).
     """
 
     spec: EnvironmentSpec
     inputs: F32
     episodes: I64
-    progress: F64 | None = None
-    success: NDArray[np.bool_] | None = None
+    progress: F64
+    success: NDArray[np.bool_]
 
     @cached_property
     def firsts(self) -> I64:
@@ -87,29 +84,25 @@ def read_frames(root: Path) -> Frames:
     Raises `ManipError` if it lacks our columns or has non-finite numbers.
     """
     dataset = Dataset.open(root)
-    spec, present = dataset.spec, list(dataset.features)
-    action = schema.EXECUTED_ACTION if schema.EXECUTED_ACTION in present else schema.ACTION
-    needed = [schema.STATE, schema.ENVIRONMENT_STATE, action]
-    more = [name for name in (schema.PROGRESS, schema.SUCCESS) if name in present]
-    table = dataset.columns([*needed, *more, EPISODE_INDEX])
-    for name in (*needed, *more):
-        require_finite(f"{root}, column {name}", table[name])
-    progress, success = table.get(schema.PROGRESS), table.get(schema.SUCCESS)
+    given = (schema.STATE, schema.ENVIRONMENT_STATE, schema.EXECUTED_ACTION)
+    table = dataset.columns([*given, schema.PROGRESS, schema.SUCCESS, EPISODE_INDEX])
+    for name, values in table.items():
+        require_finite(f"{root}, column {name}", values)
     return Frames(
-        spec,
-        np.concatenate([table[name] for name in needed], axis=1, dtype=np.float32),
+        dataset.spec,
+        np.concatenate([table[name] for name in given], axis=1, dtype=np.float32),
         table[EPISODE_INDEX].astype(np.int64).ravel(),
-        None if progress is None else progress.astype(np.float64).ravel(),
-        None if success is None else success.astype(bool).ravel(),
+        table[schema.PROGRESS].astype(np.float64).ravel(),
+        table[schema.SUCCESS].astype(bool).ravel(),
     )
 
 
-def read_all(roots: Sequence[Path]) -> list[Frames]:
+def read_all(roots: Sequence[Path]) -> tuple[Frames, ...]:
     """Return the frames of datasets.
 
     Raises `MismatchError` unless they have the same task and columns.
     """
-    found = [read_frames(root) for root in roots]
+    found = tuple(map(read_frames, roots))
     check_same_sources(roots, [one.spec for one in found], pictures=False, language=False)
     return found
 
@@ -160,6 +153,8 @@ class Pairs:
     """Pairs of clips, left and right, of equal length, from datasets of one task.
 
     Attributes:
+        format: What the file is.
+        version: Version of its format.
         robot: Name of the robot.
         task: Name of the task.
         control_hz: Control steps per second.
@@ -171,6 +166,8 @@ class Pairs:
         pairs: The left and the right clip of each pair.
     """
 
+    format: str = FORMAT
+    version: int = VERSION
     robot: str
     task: str
     control_hz: float
@@ -190,16 +187,14 @@ class Pairs:
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of `pairs.json`; a clip is [source, episode, first frame]."""
-        return {"format": FORMAT, "version": VERSION, **asdict(self)}
+        return asdict(self)
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Pairs:
         """Return the pairs that `to_json` has written."""
+        sources = tuple(Source(**one) for one in data["sources"])
         pairs = tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"])
-        plain = {
-            name: data[name] for name in ("robot", "task", "control_hz", "clip", "seed", "chosen")
-        }
-        return cls(**plain, sources=tuple(Source(**one) for one in data["sources"]), pairs=pairs)
+        return cls(**data | {"sources": sources, "pairs": pairs})
 
     @classmethod
     def read(cls, path: Path) -> Pairs:
@@ -251,14 +246,9 @@ class Clips:
         return np.concatenate([one.inputs for one in self.frames])
 
     @cached_property
-    def progress(self) -> F64 | None:
-        """True progress of all frames, (N,); None if a source has none."""
-        found = [one.progress for one in self.frames]
-        return (
-            None
-            if any(one is None for one in found)
-            else np.concatenate([one for one in found if one is not None])
-        )
+    def progress(self) -> F64:
+        """True progress of all frames, (N,)."""
+        return np.concatenate([one.progress for one in self.frames])
 
     @cached_property
     def rows(self) -> I64:
@@ -281,20 +271,16 @@ def join_pairs(given: Sequence[Pairs]) -> Pairs:
     Raises `MismatchError` if clip lengths differ.
     """
     first = given[0]
-    for other in given[1:]:
+    for other in given:
         if first.clip != other.clip:
-            raise MismatchError(
-                "clip length", "the first file of pairs", first.clip, "another", other.clip
-            )
+            raise MismatchError("clip length", "one file of pairs", first.clip, "one", other.clip)
     sources = tuple(dict.fromkeys(source for one in given for source in one.sources))
-    joined: list[tuple[Clip, Clip]] = []
-    for one in given:
-        place = [sources.index(source) for source in one.sources]
-        joined += [
-            (left._replace(source=place[left.source]), right._replace(source=place[right.source]))
-            for left, right in one.pairs
-        ]
-    return replace(first, sources=sources, pairs=tuple(joined))
+
+    def joined(clip: Clip, one: Pairs) -> Clip:
+        return clip._replace(source=sources.index(one.sources[clip.source]))
+
+    pairs = ((joined(a, one), joined(b, one)) for one in given for a, b in one.pairs)
+    return replace(first, sources=sources, pairs=tuple(pairs))
 
 
 def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
@@ -315,7 +301,7 @@ def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
                 f"the pairs' dataset {source.root} is not among the sources, or has changed since"
             )
     used = tuple(found[source.sha256] for source in pairs.sources)
-    return Clips(pairs, used, tuple(read_all(used)))
+    return Clips(pairs, used, read_all(used))
 
 
 def choose_pairs(
@@ -345,12 +331,9 @@ def choose_pairs(
 
     Raises:
         MismatchError: If datasets and reward do not all have the same task and columns.
-        ManipError: If no episode is as long as a clip, or there are too few different pairs.
+        ManipError: If there are too few different pairs of episodes as long as a clip.
     """
-    frames = tuple(read_all(roots))
-    longest = max(int(one.lengths.max()) for one in frames)
-    if longest < length:
-        raise ManipError(f"--clip is {length} control steps; the longest episode has {longest}")
+    frames = read_all(roots)
     if reward is not None:
         reward.check_fits(str(roots[0]), frames[0].spec)
     drawn = _draw(frames, length, count * (1 if reward is None else POOL), rng)
@@ -397,22 +380,25 @@ def _draw(
 
     Both clips may be from one source.
     """
-    found = dict[tuple[Clip, Clip], None]()
-    sources = [number for number, one in enumerate(frames) if one.lengths.max() >= length]
+    found = dict[frozenset[Clip], tuple[Clip, Clip]]()
+    episodes = [np.flatnonzero(one.lengths >= length) for one in frames]
+    sources = [number for number, long in enumerate(episodes) if len(long)]
+    if not sources:
+        return []
 
     def draw(source: int) -> Clip:
         """A clip of a source: a uniformly drawn episode, then a uniformly drawn first frame."""
-        lengths = frames[source].lengths
-        episode = int(rng.choice(np.flatnonzero(lengths >= length)))
-        return Clip(source, episode, int(rng.integers(0, int(lengths[episode]) - length + 1)))
+        episode = int(rng.choice(episodes[source]))
+        last = int(frames[source].lengths[episode]) - length
+        return Clip(source, episode, int(rng.integers(0, last + 1)))
 
     for left, right in rng.permutation(np.resize(sources, 2 * count)).reshape(count, 2).tolist():
         for _ in range(_TRIES):
             pair = draw(left), draw(right)
-            if pair[0] != pair[1] and pair not in found and pair[::-1] not in found:
-                found[pair] = None
+            if (both := frozenset(pair)) not in found and len(both) == 2:
+                found[both] = pair
                 break
-    return list(found)
+    return list(found.values())
 
 
 @dataclass(frozen=True)
@@ -421,17 +407,13 @@ class Answer:
 
     Attributes:
         pair: Number of the pair.
-        answer: One of `ANSWERS`.
+        answer: `left`, `right`, `equal` or `skip`.
         when: Time in ISO 8601; None if a simulated teacher answered.
     """
 
     pair: int
     answer: str
     when: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.answer not in ANSWERS:
-            raise UnknownName(f"answer about pair {self.pair}:", self.answer, ANSWERS)
 
 
 @dataclass(frozen=True)
@@ -466,28 +448,23 @@ class Preferences:
         pairs.
         """
         found = read_file(path, PREFERENCES, cls.from_json)
-        place = next(
-            (number for number, one in enumerate(pairs) if one.sha256 == found.pairs), None
-        )
-        if place is None:
-            own = pairs[0].sha256
-            raise MismatchError(
-                "sha256 of the pairs", str(path), found.pairs[:12], "the file of pairs", own[:12]
-            )
-        before = sum(map(len, pairs[:place]))
-        return replace(
-            found, answers=tuple(replace(one, pair=before + one.pair) for one in found.answers)
-        )
+        known = [one.sha256 for one in pairs]
+        if found.pairs not in known:
+            what, given = "sha256 of the pairs", found.pairs[:12]
+            raise MismatchError(what, str(path), given, "the file of pairs", known[0][:12])
+        before = sum(map(len, pairs[: known.index(found.pairs)]))
+        moved = (replace(one, pair=before + one.pair) for one in found.answers)
+        return replace(found, answers=tuple(moved))
 
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """All answers except skips.
+    """All answers that are `left`, `right` or `equal`.
 
     Attributes:
         pair: Numbers of the pairs, (A,).
         better: The answers as numbers, see `BETTER`, (A,).
-        skipped: Number of `skip` answers.
+        skipped: Number of other answers.
     """
 
     pair: I64
@@ -501,7 +478,7 @@ def join_answers(given: Sequence[Preferences]) -> Answers:
     Two answers about one pair are two observations, even if they contradict each other.
     """
     every = [one for preferences in given for one in preferences.answers]
-    kept = [one for one in every if one.answer != SKIP]
+    kept = [one for one in every if one.answer in BETTER]
     return Answers(
         np.array([one.pair for one in kept], np.int64),
         np.array([BETTER[one.answer] for one in kept], np.float64),
@@ -530,43 +507,23 @@ class Teacher:
         `UsageError` for anything else.
         """
         name, _, number = text.partition(":")
-        if name not in TEACHERS:
-            raise UnknownName("teacher", name, TEACHERS)
-        field, default = TEACHERS[name]
         try:
+            parameter, default, most = TEACHERS[name]
             value = float(number or default)
-        except ValueError:
-            value = math.nan
-        if not 0 <= value <= (1 if field == "epsilon" else math.inf):
+            if not 0 <= value <= most:
+                raise ValueError
+        except (LookupError, ValueError):
             raise UsageError(
                 f"--teacher is {text!r}; expected perfect, boltzmann:TEMPERATURE or mistaken:SHARE"
-            )
-        return cls(text, **{field: value})
-
-    def answers(self, clips: Clips, rng: np.random.Generator) -> list[str]:
-        """Return the teacher's answer about every pair.
-
-        Raises `ManipError` if the sources have no true progress.
-        """
-        if clips.progress is None:
-            raise ManipError(
-                "the sources have no progress column, which teachers need; use manip-il reward ask"
-            )
-        returns = clips.progress[clips.rows].sum(-1)
-        difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
-        mistaken = rng.random(len(returns)) < self.epsilon
-        left = chance < expit(difference / self.temperature) if self.temperature else difference > 0
-        found = np.where(left != mistaken, LEFT, RIGHT)
-        if not self.temperature:
-            found[np.abs(difference) < _ROUNDING] = EQUAL
-        return found.tolist()
+            ) from None
+        return cls(text, **{parameter: value})
 
 
-# name -> the parameter that the number after the name sets, and its default
+# name -> the parameter that the number after the name sets, its default, and its largest value
 TEACHERS = {
-    "perfect": ("epsilon", 0.0),
-    "boltzmann": ("temperature", 1.0),
-    "mistaken": ("epsilon", 0.1),
+    "perfect": ("epsilon", 0.0, 0.0),
+    "boltzmann": ("temperature", 1.0, math.inf),
+    "mistaken": ("epsilon", 0.1, 1.0),
 }
 
 
@@ -575,11 +532,17 @@ def answer_pairs(teacher: Teacher, clips: Clips, rng: np.random.Generator) -> Pr
 
     Args:
         teacher: The teacher.
-        clips: The pairs, with datasets that have a progress column.
+        clips: The pairs and their frames.
         rng: Draws the teacher's choices and mistakes; the same state gives the same answers.
-
-    Raises:
-        ManipError: If a dataset has no progress column.
     """
-    answers = [Answer(number, one) for number, one in enumerate(teacher.answers(clips, rng))]
-    return Preferences(clips.pairs.sha256, f"teacher {teacher.name}", tuple(answers))
+    returns = clips.progress[clips.rows].sum(-1)
+    difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
+    mistaken = rng.random(len(returns)) < teacher.epsilon
+    left = difference > 0
+    if teacher.temperature:
+        left = chance < expit(difference / teacher.temperature)
+    found = np.where(left != mistaken, "left", "right")
+    if not teacher.temperature:
+        found[np.abs(difference) < _ROUNDING] = "equal"
+    answers = tuple(Answer(number, one) for number, one in enumerate(found.tolist()))
+    return Preferences(clips.pairs.sha256, f"teacher {teacher.name}", answers)

@@ -68,13 +68,8 @@ class Scores:
         return float(np.quantile(self.episodes, BEST)) - BELOW
 
     @property
-    def succeeded(self) -> NDArray[np.bool_] | None:
-        """Whether each episode succeeded at some step, (E,).
-
-        None if the dataset has no success column.
-        """
-        if self.data.success is None:
-            return None
+    def succeeded(self) -> NDArray[np.bool_]:
+        """Whether each episode succeeded at some step, (E,)."""
         return np.logical_or.reduceat(self.data.success, self.data.firsts)
 
     @property
@@ -95,7 +90,7 @@ class Scores:
                 "frames": int(self.data.lengths[place]),
                 "score": float(self.episodes[place]),
                 "kept": bool(self.episodes[place] > bar),
-                "success": None if succeeded is None else bool(succeeded[place]),
+                "success": bool(succeeded[place]),
             }
             for place, number in enumerate(numbers)
         ]
@@ -119,19 +114,19 @@ def episode_scores(values: F64, frames: Frames) -> F64:
     return (sums[ends] - sums[begins]) / (ends - begins)
 
 
-def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
+def roc_auc(scores: F64, succeeded: NDArray[np.bool_]) -> float | None:
     """Return P(a failed episode's score is below a successful one's).
 
     Ties count half (Mann and Whitney 1947).
 
     Args:
         scores: Scores of the episodes, (E,).
-        succeeded: Whether each episode succeeded, (E,); None if this is unknown.
+        succeeded: Whether each episode succeeded, (E,).
 
     Returns:
-        The probability; None if all or none of the episodes succeeded, or if this is unknown.
+        The probability; None if all or none of the episodes succeeded.
     """
-    if succeeded is None or succeeded.all() or not succeeded.any():
+    if succeeded.all() or not succeeded.any():
         return None
     good, bad = scores[succeeded], scores[~succeeded]
     found: Any = mannwhitneyu(good, bad, method="asymptotic")
@@ -169,7 +164,7 @@ def worst_table(scores: Scores) -> Table:
         (
             str(data.episodes[data.firsts[place]]),
             f"{scores.episodes[place]:.2f}",
-            "" if succeeded is None else ("yes" if succeeded[place] else "no"),
+            "yes" if succeeded[place] else "no",
             f"{data.lengths[place]:,}",
         )
         for place in np.argsort(scores.episodes, kind="stable")[:WORST].tolist()

@@ -31,7 +31,6 @@ from manip_il.cli.outputs import publish
 from manip_il.cli.progress import progress, say
 from manip_il.data.atomic import write_file, write_json
 from manip_il.data.dataset import Dataset
-from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import find_policy
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.seeding import rng_for, stream_base
@@ -112,14 +111,12 @@ PROGRESS = "progress"  # value of --reward: score by true progress
 def run_score(options: ScoreOptions) -> None:
     """Score, print the worst episodes, write the files."""
     data = read_frames(options.dataset)
-    if options.reward != PROGRESS:
+    if options.reward == PROGRESS:
+        found = data.progress
+    else:
         reward = LearnedReward.load(find_policy(Path(options.reward).expanduser()))
         reward.check_fits(str(options.dataset), data.spec)
         found = reward(data.inputs).astype("float64").clip(0.0, 1.0)
-    elif data.progress is not None:
-        found = data.progress
-    else:
-        raise ManipError(f"{options.dataset} has no progress column; give --reward=FOLDER")
     scores = scoring.Scores(str(options.dataset), options.reward, data, found)
     with options.open(Path(options.reward).expanduser()) as folder:
         scoring.write_weights(folder / scoring.WEIGHTS_FILE, scores)
