@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 
 from manip_il.chapter.rewards.max_entropy import SoftPlan
-from manip_il.tasks.carry.grid import Demonstration, PathProblem, cheapest_path, plan
+from manip_il.tasks.carry.grid import Demonstration, PathProblem, plan
 
 
 def grid(
@@ -94,9 +94,7 @@ def demonstrations(count: int, weights: np.ndarray, seed: int = 0, **kwargs) -> 
     for _ in range(count):
         problem = grid(rng, **kwargs)
         start = int(rng.integers(problem.nodes // 2))
-        found.append(
-            Demonstration(problem, cheapest_path(problem, plan(problem, weights), start)[0])
-        )
+        found.append(Demonstration(problem, plan(problem, weights).path(start)[0]))
     return found
 
 
@@ -106,6 +104,6 @@ def excess(weights: np.ndarray, truth: np.ndarray, seed: int = 1, **kwargs) -> f
     for _ in range(40):
         problem = grid(rng, **kwargs)
         start = int(rng.integers(problem.nodes // 2))
-        paid += cheapest_path(problem, plan(problem, weights), start)[1] @ truth
+        paid += plan(problem, weights).path(start)[1] @ truth
         least += plan(problem, truth).costs[start]
     return float(paid / least - 1)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from manip_il.mdp import F64, I64
-from manip_il.tasks.carry.grid import Demonstration, add_rivals, rivals
+from manip_il.tasks.carry.grid import Demonstration, rivals
 
 Density = Callable[[F64], F64]  # log-densities (C,) at points (C, K)
 PRIOR = 300.0  # mean of a weight [1/m]
@@ -103,7 +103,7 @@ def fit(
     sums = rivals(demonstrations, rng.exponential(prior, (TASTES, size)))
     for _ in range(_ROUNDS):
         quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 5, _WARM_UP)
-        sums = add_rivals(demonstrations, sums, quick.thin(_MORE))
+        sums = rivals(demonstrations, quick.thin(_MORE), sums)
     return draw_posterior(Choices.of(sums), rng, prior)
 
 

@@ -51,10 +51,8 @@ class SoftPlan:
         """Return the expected number of visits to each edge from node `start` on, (E,) (Ziebart et
         al. 2008, alg. 1).
 
-        Raises `ManipError` if no path leads to the goal.
+        Raises `ManipError` if very long paths are likely.
         """
-        if not np.isfinite(self.values[start]):
-            raise ManipError(f"no path leads from node {start} to the goal")
         moves = self.problem.matrix(self.chances).T.tocsr()
         now = np.zeros(self.problem.nodes)
         now[start] = 1.0
@@ -81,7 +79,7 @@ def soft_plan(problem: PathProblem, weights: F64) -> SoftPlan:
     Raises `ManipError` if the sum over all paths is infinite, because their number grows faster
     than exp(cost) (the spectral radius of the module's M is 1 or more).
     """
-    costs, edges = problem.costs(weights), problem.edges
+    costs, edges = problem.features @ weights, problem.edges
     hard = plan(problem, weights).costs
     known = np.where(np.isfinite(hard), hard, 0.0)
     leads = np.isfinite(hard)[edges[:, 1]] & (edges[:, 0] != problem.goal)

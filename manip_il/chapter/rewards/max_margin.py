@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.tasks.carry.grid import LENGTH, Demonstration, cheapest_path, plan_edges, stages
+from manip_il.tasks.carry.grid import LENGTH, Demonstration, plan, stages
 
 MARGIN = 0.05  # margin per metre of path off the demonstration
 RIDGE = 1e-4  # factor of the penalty, half the squared weights
@@ -45,8 +45,8 @@ def loss_of(
     off = np.ones(problem.nodes, bool)
     off[demonstration.path] = False
     loss = margin * problem.features[:, LENGTH] * off[problem.edges[:, 1]]
-    planned = plan_edges(problem, problem.costs(weights) - loss)
-    _, sums = cheapest_path(problem, planned, demonstration.start)
+    planned = plan(problem, weights, loss)
+    _, sums = planned.path(demonstration.start)
     return (
         float(demonstration.sums @ weights - planned.costs[demonstration.start]),
         demonstration.sums - sums,

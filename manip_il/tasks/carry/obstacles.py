@@ -166,7 +166,7 @@ def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layou
         return np.array([seen[f"{of}.{axis}"] for axis in "xyz"], dtype=np.float64)
 
     width = seen[f"{name}.width"]
-    lengths = [width, seen.get(f"{name}.length", width), seen.get(f"{name}.height", width)]
+    lengths = [seen.get(f"{name}.{which}", width) for which in ("width", "length", "height")]
     places = {one: vector(one) for one in OBSTACLES if seen[f"{one}.here"] > 0.5}
     edge = (vector(EDGE), vector(f"{EDGE}.outwards")) if seen[f"{EDGE}.here"] > 0.5 else None
     return make_layout(scene, lengths, vector("goal"), places, edge)
@@ -218,7 +218,13 @@ def hand_of(scene: Scene) -> HandShape:
     data.qpos[scene.arm_q] = scene.robot.home
     scene.gripper.put(data, scene.gripper.most)
     mujoco.mj_kinematics(model, data)
-    ee, moved = data.site_xpos[scene.ee_site], _last_bodies(scene)
+    # what the arm's last two joints move
+    [first] = model.jnt_bodyid[model.jnt_qposadr == scene.arm_q[-2]].tolist()
+    moved = {first}
+    for body in range(first + 1, model.nbody):
+        if int(model.body_parentid[body]) in moved:
+            moved.add(body)
+    ee = data.site_xpos[scene.ee_site]
     axes = data.site_xmat[scene.ee_site].reshape(3, 3)[:, :2]
     outlines = [
         outline(model, data, geom) - ee
@@ -271,14 +277,3 @@ def fits(hand: HandShape, at: Sequence[float], yaw: float, layout: Layout) -> bo
             if max(apart.max(), across.max()) < _BARELY:
                 return False
     return True
-
-
-def _last_bodies(scene: Scene) -> set[int]:
-    """Bodies that the arm's last two joints move."""
-    model = scene.model
-    first = int(model.jnt_bodyid[np.flatnonzero(model.jnt_qposadr == scene.arm_q[-2])[0]])
-    found = {first}
-    for body in range(first + 1, model.nbody):
-        if int(model.body_parentid[body]) in found:
-            found.add(body)
-    return found

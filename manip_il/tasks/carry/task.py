@@ -204,11 +204,9 @@ class Carry(PickPlace):
     def unsound(self, world: World) -> str:
         """Return why there is no sound label, or "" if there is one.
 
-        There is none if obstacles overlap, the hand has no room, or no path leads to the goal.
+        There is none if the hand has no room, or no path leads to the goal.
         """
         layout, at = layout_of(world, OBJECT), world.at(OBJECT)
-        if layout.meeting:
-            return "two obstacles overlap"
         if is_held(world, OBJECT):
             leads = _at_goal(world) or _look(world)[1] is not None
         else:
