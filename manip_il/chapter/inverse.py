@@ -145,8 +145,9 @@ def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.G
     unknown = open_features(demonstrations, rivals(demonstrations, tastes))
     intervals = None
     if method == "bayesian":
-        found = bayesian.fit(demonstrations, rng)
-        weights, intervals = found.mean, found.ratios(LENGTH, LEVEL)
+        draws = bayesian.fit(demonstrations, rng)
+        weights, ratios = draws.mean(axis=0), draws / draws[:, [LENGTH]]
+        intervals = np.quantile(ratios, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0).T
     else:
         weights = (max_margin if method == "max_margin" else max_entropy).fit(demonstrations)
     weights = weights / weights[LENGTH]
@@ -267,17 +268,17 @@ def _cost_figure(found: Inverse) -> Figure:
     shown = sorted(pairs, key=lambda pair: -len(pair[0].grid.layout.places))[:_PANELS]
     with drawing(len(shown), size=(3.0, 3.1)) as (drawn, axes):
         for axis, (one, (path, _)) in zip(axes[0], shown, strict=True):
-            grid, layout = one.grid, one.grid.layout
-            points = grid.points.reshape(*grid.shape, 3)
-            level = np.abs(points[0, 0, :, 2] - np.median(one.positions[:, 2])).argmin()
-            x, y, _ = (over := points[:, :, level]).T
-            costs = layout.densities(over.reshape(-1, 3)) @ found.learnt.weights
-            image = axis.contourf(x.T, y.T, costs.reshape(x.T.shape), levels=20, cmap="Greens")
-            for name, place in layout.places:
-                axis.annotate(name, place, ha="center", va="center", fontsize=6.5)
-            axis.plot(*one.positions[:, :2].T, "-", color=DAGGER, lw=1.8, label="demonstrated")
-            axis.plot(*grid.points[path, :2].T, "--", color=CLONING, lw=1.6, label="re-planned")
-            drawn.colorbar(image, ax=axis, location="bottom", shrink=0.8, pad=0.02)
+            points = one.grid.points
+            over = points.reshape(*one.grid.shape, 3)[:, :, 0].copy()
+            over[:, :, 2] = np.median(one.positions[:, 2])
+            costs = one.grid.layout.densities(over.reshape(-1, 3)) @ found.learnt.weights
+            costs = costs.reshape(over.shape[:2])
+            image = axis.contourf(over[:, :, 0], over[:, :, 1], costs, 20, cmap="Greens")
+            drawn.colorbar(image, ax=axis, location="bottom", shrink=0.8)
+            for name, place in one.grid.layout.places:
+                axis.text(*place, name, ha="center", va="center")
+            axis.plot(*one.positions[:, :2].T, "-", color=DAGGER, label="demonstrated")
+            axis.plot(*points[path, :2].T, "--", color=CLONING, label="re-planned")
             axis.set(title=f"episode {one.episode}", xticks=[], yticks=[], aspect="equal")
         drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
         return to_figure(

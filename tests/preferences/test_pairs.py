@@ -86,7 +86,7 @@ def test_no_path_in_a_file_of_pairs_is_opened(clips):
     tree = clips.pairs.to_json()
     for source in tree["sources"]:
         source["root"] = "nowhere"
-    assert (read_clips(Pairs.from_json(tree), clips.roots).inputs == clips.inputs).all()
+    assert (read_clips(Pairs.from_json(tree), clips.roots).data.inputs == clips.data.inputs).all()
 
 
 def test_answers_to_a_second_file_of_pairs_are_about_its_clips(datasets, tmp_path):
@@ -98,7 +98,7 @@ def test_answers_to_a_second_file_of_pairs_are_about_its_clips(datasets, tmp_pat
     assert [source.root for source in joined.sources] == list(map(str, roots))
     both = read_clips(joined, roots)
     alone = read_clips(files[1], roots)
-    assert (both.inputs[both.rows[12:]] == alone.inputs[alone.rows]).all()
+    assert (both.data.inputs[both.rows[12:]] == alone.data.inputs[alone.rows]).all()
     path = tmp_path / "preferences.json"
     path.write_text(json.dumps(Preferences(files[1].sha256, "Ada", (Answer(3, "left"),)).to_json()))
     assert [one.pair for one in Preferences.read(path, files).answers] == [15]

@@ -93,7 +93,7 @@ def fit_answers(
         ManipError: If fewer pairs have answers than there are networks.
     """
     folds = deal(answers.pair, shape.members, seed)
-    inputs, sides = torch.from_numpy(clips.inputs), torch.from_numpy(clips.rows[answers.pair])
+    inputs, sides = torch.from_numpy(clips.data.inputs), torch.from_numpy(clips.rows[answers.pair])
     with threads(1):
         network = RewardNetwork(inputs.shape[1], shape)
         network.initialise(generator_of(seed, 0))
@@ -119,7 +119,7 @@ def fit_answers(
 
 def true_difference(clips: Clips) -> F64:
     """Return the mean true progress of each left clip minus that of the right one, (P,)."""
-    means = clips.progress[clips.rows].mean(axis=-1)
+    means = clips.data.progress[clips.rows].mean(axis=-1)
     return means[:, 0] - means[:, 1]
 
 

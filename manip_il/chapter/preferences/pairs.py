@@ -29,7 +29,7 @@ from manip_il import checks
 from manip_il.chapter.reward import LearnedReward
 from manip_il.data import schema
 from manip_il.data.build import dataset_sha256
-from manip_il.data.dataset import Dataset
+from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import in_one_line
@@ -78,33 +78,26 @@ class Frames:
         return np.diff(self.firsts, append=len(self.inputs))
 
 
-def read_frames(root: Path) -> Frames:
-    """Return the frames of a dataset.
+def read_frames(*sources: Dataset | Path) -> Frames:
+    """Return the frames of one or more datasets, whose episodes are numbered consecutively.
 
-    Raises `ManipError` if it lacks our columns or has non-finite numbers.
+    Raises `MismatchError` unless they have the same task and columns, and `ManipError` if one lacks
+    our columns or has non-finite numbers.
     """
-    dataset = Dataset.open(root)
+    datasets = [one if isinstance(one, Dataset) else Dataset.open(one) for one in sources]
+    roots, specs = [one.root for one in datasets], [one.spec for one in datasets]
+    check_same_sources(roots, specs, pictures=False, language=False)
     given = (schema.STATE, schema.ENVIRONMENT_STATE, schema.EXECUTED_ACTION)
-    table = dataset.columns([*given, schema.PROGRESS, schema.SUCCESS, EPISODE_INDEX])
+    table = joined_columns(datasets, [*given, schema.PROGRESS, schema.SUCCESS, EPISODE_INDEX])
     for name, values in table.items():
-        require_finite(f"{root}, column {name}", values)
+        require_finite(f"{', '.join(map(str, roots))}, column {name}", values)
     return Frames(
-        dataset.spec,
+        specs[0],
         np.concatenate([table[name] for name in given], axis=1, dtype=np.float32),
         table[EPISODE_INDEX].astype(np.int64).ravel(),
         table[schema.PROGRESS].astype(np.float64).ravel(),
         table[schema.SUCCESS].astype(bool).ravel(),
     )
-
-
-def read_all(roots: Sequence[Path]) -> tuple[Frames, ...]:
-    """Return the frames of datasets.
-
-    Raises `MismatchError` unless they have the same task and columns.
-    """
-    found = tuple(map(read_frames, roots))
-    check_same_sources(roots, [one.spec for one in found], pictures=False, language=False)
-    return found
 
 
 def find_datasets(folders: Sequence[Path]) -> list[Path]:
@@ -228,41 +221,22 @@ class Clips:
     Attributes:
         pairs: The pairs.
         roots: Folders of the datasets, in the order of `Pairs.sources`.
-        frames: Frames of each dataset, in the same order.
+        data: Frames of the datasets, in the same order.
     """
 
     pairs: Pairs
     roots: tuple[Path, ...]
-    frames: tuple[Frames, ...]
-
-    @cached_property
-    def offsets(self) -> I64:
-        """Row of each source's first frame in `inputs`, (S,)."""
-        return np.cumsum([0, *(len(one.inputs) for one in self.frames)])[:-1]
-
-    @cached_property
-    def inputs(self) -> F32:
-        """A reward's inputs for all frames, (N, d)."""
-        return np.concatenate([one.inputs for one in self.frames])
-
-    @cached_property
-    def progress(self) -> F64:
-        """True progress of all frames, (N,)."""
-        return np.concatenate([one.progress for one in self.frames])
+    data: Frames
 
     @cached_property
     def rows(self) -> I64:
-        """Rows of `inputs` that hold the frames of the left and right clips, (P, 2, L)."""
+        """Rows of `data` that hold the frames of the left and right clips, (P, 2, L)."""
+        episodes = np.cumsum([0, *(source.episodes for source in self.pairs.sources)])
         begin = [
-            [
-                self.offsets[clip.source]
-                + self.frames[clip.source].firsts[clip.episode]
-                + clip.first
-                for clip in pair
-            ]
+            [self.data.firsts[episodes[clip.source] + clip.episode] + clip.first for clip in pair]
             for pair in self.pairs.pairs
         ]
-        return np.array(begin, np.int64).reshape(-1, 2, 1) + np.arange(self.pairs.clip)
+        return np.array(begin, np.int64)[:, :, None] + np.arange(self.pairs.clip)
 
 
 def join_pairs(given: Sequence[Pairs]) -> Pairs:
@@ -301,7 +275,7 @@ def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
                 f"the pairs' dataset {source.root} is not among the sources, or has changed since"
             )
     used = tuple(found[source.sha256] for source in pairs.sources)
-    return Clips(pairs, used, read_all(used))
+    return Clips(pairs, used, read_frames(*used))
 
 
 def choose_pairs(
@@ -333,34 +307,34 @@ def choose_pairs(
         MismatchError: If datasets and reward do not all have the same task and columns.
         ManipError: If there are too few different pairs of episodes as long as a clip.
     """
-    frames = read_all(roots)
-    if reward is not None:
-        reward.check_fits(str(roots[0]), frames[0].spec)
-    drawn = _draw(frames, length, count * (1 if reward is None else POOL), rng)
+    datasets = [Dataset.open(root) for root in roots]
+    data = read_frames(*datasets)
+    spec = data.spec
+    lengths = np.split(data.lengths, np.cumsum([one.info.episodes for one in datasets])[:-1])
+    drawn = _draw(lengths, length, count * (POOL if reward else 1), rng)
     if len(drawn) < count:
         raise ManipError(
             f"--count is {count}; only {len(drawn)} pairs of clips of {length} steps were found"
         )
-    spec = frames[0].spec
     made = Pairs(
         robot=spec.robot,
         task=spec.task,
         control_hz=spec.fps,
         clip=length,
         sources=tuple(
-            Source(str(root), dataset_sha256(root), len(one.firsts), len(one.inputs))
-            for root, one in zip(roots, frames, strict=True)
+            Source(str(one.root), dataset_sha256(one.root), one.info.episodes, len(one))
+            for one in datasets
         ),
         pairs=tuple(drawn),
         seed=seed,
     )
     if reward is not None:
-        spread = disagreement(Clips(made, tuple(roots), frames), reward.members)
+        reward.check_fits(str(roots[0]), spec)
+        spread = disagreement(Clips(made, tuple(roots), data), reward.members)
         kept = np.sort(np.argsort(-spread, kind="stable")[:count])
-        made = replace(
-            made, pairs=tuple(drawn[place] for place in kept), chosen="where rewards disagree"
-        )
-    return Clips(made, tuple(roots), frames)
+        pairs = tuple(drawn[place] for place in kept)
+        made = replace(made, pairs=pairs, chosen="where rewards disagree")
+    return Clips(made, tuple(roots), data)
 
 
 def disagreement(clips: Clips, members: Members) -> F64:
@@ -368,20 +342,21 @@ def disagreement(clips: Clips, members: Members) -> F64:
     per pair, (P,).
     """
     rows = clips.rows
-    rewards = members(clips.inputs[rows.reshape(-1)])
+    rewards = members(clips.data.inputs[rows.reshape(-1)])
     returns = rewards.reshape(len(rewards), *rows.shape).sum(-1)
     return expit(returns[:, :, 0] - returns[:, :, 1]).std(axis=0)
 
 
 def _draw(
-    frames: Sequence[Frames], length: int, count: int, rng: np.random.Generator
+    lengths: Sequence[I64], length: int, count: int, rng: np.random.Generator
 ) -> list[tuple[Clip, Clip]]:
-    """Distinct pairs of clips; all sources appear equally often.
+    """Distinct pairs of clips, given the length of each source's episodes; all sources appear
+    equally often.
 
     Both clips may be from one source.
     """
     found = dict[frozenset[Clip], tuple[Clip, Clip]]()
-    episodes = [np.flatnonzero(one.lengths >= length) for one in frames]
+    episodes = [np.flatnonzero(one >= length) for one in lengths]
     sources = [number for number, long in enumerate(episodes) if len(long)]
     if not sources:
         return []
@@ -389,7 +364,7 @@ def _draw(
     def draw(source: int) -> Clip:
         """A clip of a source: a uniformly drawn episode, then a uniformly drawn first frame."""
         episode = int(rng.choice(episodes[source]))
-        last = int(frames[source].lengths[episode]) - length
+        last = int(lengths[source][episode]) - length
         return Clip(source, episode, int(rng.integers(0, last + 1)))
 
     for left, right in rng.permutation(np.resize(sources, 2 * count)).reshape(count, 2).tolist():
@@ -535,7 +510,7 @@ def answer_pairs(teacher: Teacher, clips: Clips, rng: np.random.Generator) -> Pr
         clips: The pairs and their frames.
         rng: Draws the teacher's choices and mistakes; the same state gives the same answers.
     """
-    returns = clips.progress[clips.rows].sum(-1)
+    returns = clips.data.progress[clips.rows].sum(-1)
     difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
     mistaken = rng.random(len(returns)) < teacher.epsilon
     left = difference > 0

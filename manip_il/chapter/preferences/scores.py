@@ -57,8 +57,12 @@ class Scores:
 
     @cached_property
     def episodes(self) -> F64:
-        """Score of each episode, (E,)."""
-        return episode_scores(self.frames, self.data)
+        """Score of each episode, the mean over its last `LAST` seconds, (E,)."""
+        last = max(1, round(LAST * self.data.spec.fps))
+        ends = self.data.firsts + self.data.lengths
+        begins = np.maximum(self.data.firsts, ends - last)
+        sums = np.concatenate([[0.0], np.cumsum(self.frames)])
+        return (sums[ends] - sums[begins]) / (ends - begins)
 
     @property
     def bar(self) -> float:
@@ -101,17 +105,6 @@ class Scores:
             "bar": bar,
             "episodes": episodes,
         }
-
-
-def episode_scores(values: F64, frames: Frames) -> F64:
-    """Return the mean of the frames' values (N,) over the last `LAST` seconds of each episode,
-    (E,).
-    """
-    last = max(1, round(LAST * frames.spec.fps))
-    ends = frames.firsts + frames.lengths
-    begins = np.maximum(frames.firsts, ends - last)
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    return (sums[ends] - sums[begins]) / (ends - begins)
 
 
 def roc_auc(scores: F64, succeeded: NDArray[np.bool_]) -> float | None:

@@ -54,7 +54,7 @@ def run_ask(options: AskOptions) -> None:
     clips = read_clips(Pairs.read(options.pairs), find_datasets(options.sources))
     with progress(len(clips.pairs), "render") as bar:
         films = render_films(clips, options.robot, bar.step)
-    page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
+    page = render_page(clips.pairs, clips.data.spec.instruction, films)
     write_file(options.output, page.encode())
     say(f"{len(clips.pairs):,} pairs: {options.output}")
 
@@ -75,14 +75,14 @@ def run_fit(options: FitOptions) -> None:
     answers = join_answers([Preferences.read(path, pairs) for path in options.answers])
     clips = read_clips(join_pairs(pairs), find_datasets(options.sources))
     with progress(None, f"fit {len(answers.better):,} answers") as bar:
-        shape = shape_for(clips.frames[0].spec, options.members)
+        shape = shape_for(clips.data.spec, options.members)
         found = fit_answers(clips, answers, shape, stream_base("training", options.seed), bar.step)
     fingerprint = Dataset.open(clips.roots[0]).fingerprint
     stored = {"seed": options.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.clip}
     with options.open() as folder:
         target = folder / PRETRAINED_MODEL
         target.mkdir(parents=True, exist_ok=True)
-        write_reward(target, found.network, clips.frames[0].spec, stored, fingerprint)
+        write_reward(target, found.network, clips.data.spec, stored, fingerprint)
         write_json(folder / "fit.json", found.to_json())
     say(*summary_lines(found, answers), f"reward: {folder}")
 

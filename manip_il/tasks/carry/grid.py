@@ -219,15 +219,14 @@ class _Links(NamedTuple):
 @lru_cache(4)
 def _links(shape: tuple[int, ...]) -> _Links:
     steps = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)]) - 1
-    places = _indices(shape)[:, None]
-    to = places + steps
+    places = _indices(shape)
+    to = places[:, None] + steps
     inside = ((to >= 0) & (to < shape)).all(axis=2)
-    start, end = np.broadcast_to(places, to.shape)[inside], to[inside]
-    nodes = [_numbers(index, shape) for index in (start, end)]
-    doubled = [_numbers(index, _finer(shape)) for index in (2 * start, start + end, 2 * end)]
-    return _Links(
-        np.stack(nodes, axis=1), np.stack(doubled, axis=1), np.linalg.norm(end - start, axis=1)
-    )
+    start, way = np.nonzero(inside)
+    edges = np.stack([start, _numbers(to[inside], shape)], axis=1)
+    ends = _numbers(2 * places, _finer(shape))[edges]
+    fine = np.insert(ends, 1, ends.sum(axis=1) // 2, axis=1)
+    return _Links(edges, fine, np.linalg.norm(steps, axis=1)[way])
 
 
 def _finer(shape: tuple[int, ...]) -> tuple[int, ...]:

@@ -46,12 +46,6 @@ def weights_with(**weights: float) -> np.ndarray:
     return np.array([{"length": 1.0, **weights}.get(name, 0.0) for name in FEATURES])
 
 
-def test_a_layouts_grid_has_ten_thousand_nodes_and_the_goal_is_one_of_them():
-    assert len(grid().points) >= 10_000
-    np.testing.assert_allclose(grid().points[grid().goal], LAYOUT.goal, atol=1e-12)
-    assert grid().free[grid().goal]
-
-
 @pytest.mark.parametrize("taste", TASTES)
 def test_costs_to_go_are_the_cheapest_paths_features_times_the_weights(taste: str):
     weights, problem = np.array(TASTES[taste].weights), grid().problem
@@ -99,16 +93,6 @@ def test_the_descent_leads_to_the_goal_past_all_obstacles(seed: int):
     assert math.dist(position, LAYOUT.goal) < 0.005
     assert np.diff(costs).max(initial=0.0) < 0.02 * costs[0] + 0.01
     assert costs[-1] < 0.05
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_the_descent_leads_on_from_beside_any_node(seed: int):
-    down, rng = descent(LAYOUT, CAREFUL, ROBOT), np.random.default_rng(seed)
-    node = rng.choice(np.flatnonzero(np.isfinite(down.costs)))
-    position = grid().points[node] + rng.uniform(-1e-3, 1e-3, 3)
-    heading = down.look(position)[1]
-    assert heading is not None
-    assert node == grid().goal or np.linalg.norm(heading - position) > 0.005
 
 
 @every_robot
