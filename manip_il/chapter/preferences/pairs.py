@@ -185,9 +185,11 @@ class Pairs:
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Pairs:
         """Return the pairs that `to_json` has written."""
-        sources = tuple(Source(**one) for one in data["sources"])
-        pairs = tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"])
-        return cls(**data | {"sources": sources, "pairs": pairs})
+        made: dict[str, Any] = {
+            "sources": tuple(Source(**one) for one in data["sources"]),
+            "pairs": tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"]),
+        }
+        return cls(**data | made)
 
     @classmethod
     def read(cls, path: Path) -> Pairs:

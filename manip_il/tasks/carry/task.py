@@ -120,11 +120,6 @@ def _rise(world: World) -> float:
     return min(STEEP * max(0.0, g.off - OVER), max(0.0, safe - g.at[2]))
 
 
-def _approach(world: World, name: str, hover: float) -> Target:
-    """Approach as for any object, but above all obstacles until the hand is over the object."""
-    return approach(world, name, hover, _rise(world))
-
-
 @dataclass(frozen=True)
 class Carry(PickPlace):
     """Carry an object past obstacles to the goal, as cheaply as possible for a reward.
@@ -142,7 +137,10 @@ class Carry(PickPlace):
     rungs = (
         Rung("at_goal", lambda w: is_held(w, OBJECT) and _at_goal(w), _to_goal),
         Rung("carry", lambda w: is_held(w, OBJECT), _to_goal),
-        *grasp_rungs(lambda w: OBJECT, approach=_approach),
+        # above all obstacles until the hand is over the object
+        *grasp_rungs(
+            lambda w: OBJECT, approach=lambda w, name, hover: approach(w, name, hover, _rise(w))
+        ),
     )
     scale: float = 1.0
     reward: Reward = TASTES[DEFAULT]
