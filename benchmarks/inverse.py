@@ -77,7 +77,7 @@ def unseen(robot: str, count: int, seed: int) -> Iterator[tuple[PathProblem, int
     env = env_of(make_config(robot, CARRY))
     for one in stream_seeds("held_out", count, seed):
         env.reset(seed=one)
-        grid = Grid(layout_of(env.world, OBJECT), env.world.scene.robot)
+        grid = Grid(layout_of(env.world), env.world.scene.robot)
         at = env.world.pose(OBJECT).position
         near = grid.near(at)
         yield grid.problem, int(near[np.argmin(np.linalg.norm(grid.points[near] - at, axis=1))])

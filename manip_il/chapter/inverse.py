@@ -85,7 +85,7 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
     for episode in np.unique(index[table[schema.SUCCESS].ravel()]).tolist():
         on_episode()
         rows = table[schema.ENVIRONMENT_STATE][index == episode].astype(np.float64)
-        layout = observed_layout(scene, OBJECT, dict(zip(names, rows[0].tolist(), strict=True)))
+        layout = observed_layout(scene, dict(zip(names, rows[0].tolist(), strict=True)))
         positions = carried_stretch(rows[:, at], np.array(layout.goal))
         grid = Grid(layout, scene.robot)
         path = grid.snap(positions)

@@ -82,7 +82,7 @@ _SIDES = ((1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 def descent_of(world: World) -> Descent:
     """Return the costs-to-go of a world's episode, as a `Descent` to the goal."""
-    return descent(layout_of(world, OBJECT), reward_in(world), world.robot)
+    return descent(layout_of(world), reward_in(world), world.robot)
 
 
 @once_per_state
@@ -101,7 +101,7 @@ def _to_goal(world: World) -> Target:
     at, ee = world.at(OBJECT), world.ee.position
     position = ee + (0.0 if heading is None else heading - at)
     position[2] = max(position[2], world.robot.ee.lowest)
-    beside = layout_of(world, OBJECT).room(at[None])[0] < 0  # a turning hand would hit an obstacle
+    beside = layout_of(world).room(at[None])[0] < 0  # a turning hand would hit an obstacle
     yaw = world.hand_yaw if beside else world.ahead(position)
     return Target(position, hand_down(yaw), CLOSED, max_step=STEP)
 
@@ -111,7 +111,7 @@ def _rise(world: World) -> float:
 
     It grows with misalignment until the hand clears every obstacle.
     """
-    layout, g = layout_of(world, OBJECT), grasp_of(world, OBJECT)
+    layout, g = layout_of(world), grasp_of(world, OBJECT)
     if not layout.boxes:
         return 0.0
     tallest = max(height for _, _, _, height in layout.boxes)
@@ -204,7 +204,7 @@ class Carry(PickPlace):
 
         There is none if the hand has no room, or no path leads to the goal.
         """
-        layout, at = layout_of(world, OBJECT), world.at(OBJECT)
+        layout, at = layout_of(world), world.at(OBJECT)
         if is_held(world, OBJECT):
             leads = _at_goal(world) or _look(world)[1] is not None
         else:
