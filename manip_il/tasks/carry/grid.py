@@ -54,14 +54,18 @@ class PathProblem:
     @cached_property
     def numbers(self) -> Any:
         """Edge numbers, counted from 1, as a sparse matrix (from, to), (S, S)."""
-        return self.matrix(np.arange(1, len(self.edges) + 1))
+        numbers = np.arange(1, len(self.edges) + 1)
+        return csr_array((numbers, self.edges.T), shape=(self.nodes, self.nodes))
 
-    def matrix(self, values: NDArray[Any]) -> Any:
+    def matrix(self, values: F64) -> Any:
         """Return the edges' values (E,) as a sparse matrix (from, to), (S, S).
 
         Zeros are stored, too.
         """
-        return csr_array((values, self.edges.T), shape=(self.nodes, self.nodes))
+        numbers = self.numbers
+        return csr_array(
+            (values[numbers.data - 1], numbers.indices, numbers.indptr), shape=numbers.shape
+        )
 
     def sums(self, path: I64) -> F64:
         """Return the feature sums (K,) over the edges of a path of nodes (n,).
