@@ -66,13 +66,6 @@ def test_a_run_stands_for_the_datasets_of_its_rounds(tmp_path, datasets):
     assert [path.parent.name for path in find_datasets([tmp_path])] == ["round_000", "round_001"]
 
 
-def test_pairs_are_the_same_from_their_file(clips, tmp_path):
-    path = tmp_path / "pairs.json"
-    path.write_text(json.dumps(clips.pairs.to_json()))
-    assert Pairs.read(path) == clips.pairs
-    assert (read_clips(Pairs.read(path), clips.roots).rows == clips.rows).all()
-
-
 def test_a_dataset_that_was_changed_since_is_refused(clips):
     tree = clips.pairs.to_json()
     tree["sources"][0]["sha256"] = "0" * 64
