@@ -82,7 +82,7 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
     index = table[EPISODE_INDEX].ravel()
     at = [names.index(f"{OBJECT}.{axis}") for axis in "xyz"]
     found = list[Carried]()
-    for episode in np.unique(index[table[schema.SUCCESS].ravel()]).tolist():
+    for episode in np.unique(index[table[schema.SUCCESS].ravel() != 0]).tolist():
         on_episode()
         rows = table[schema.ENVIRONMENT_STATE][index == episode].astype(np.float64)
         layout = observed_layout(scene, dict(zip(names, rows[0].tolist(), strict=True)))
