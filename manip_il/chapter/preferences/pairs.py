@@ -249,7 +249,7 @@ def join_pairs(given: Sequence[Pairs]) -> Pairs:
     first = given[0]
     for other in given:
         if first.clip != other.clip:
-            raise MismatchError("clip length", "one file of pairs", first.clip, "one", other.clip)
+            raise MismatchError("clip length", "one file", first.clip, "another", other.clip)
     sources = tuple(dict.fromkeys(source for one in given for source in one.sources))
 
     def joined(clip: Clip, one: Pairs) -> Clip:
