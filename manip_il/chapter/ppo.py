@@ -106,7 +106,7 @@ class ActorCritic(nn.Module):
     def log_prob(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Return log-densities of actions (B, n), and entropies, both (B,) [nats]."""
         gaussian, live = self.gaussian(obs), 1.0 - obs[:, -EXTRA]
-        log_prob, entropy = gaussian.log_prob(actions) * self._free, gaussian.entropy() * self._free
+        log_prob, entropy = gaussian.log_prob(actions) * self.free, gaussian.entropy() * self.free
         return log_prob.sum(1) * live, entropy.sum(1) * live
 
     def values(self, obs: Tensor) -> Tensor:
@@ -130,18 +130,11 @@ class ActorCritic(nn.Module):
     @property
     def log_std(self) -> Tensor:
         """Log-deviations of the action dimensions that vary, (m,), in normalised units."""
-        return floored_log_std(self.head.raw_log_std)[self._free > 0]
+        return floored_log_std(self.head.raw_log_std)[self.free > 0]
 
     @property
-    def spread(self) -> Tensor:
-        """Deviations of the action dimensions, (n,), in normalised units.
-
-        0 for those that never vary.
-        """
-        return floored_log_std(self.head.raw_log_std).exp().detach() * self._free
-
-    @property
-    def _free(self) -> Tensor:
+    def free(self) -> Tensor:
+        """1 for the action dimensions that vary, else 0, (n,)."""
         return (self.actor.target_scale > 0).float()
 
 
@@ -205,7 +198,8 @@ class Learner:
         raw = MIN_LOG_STD + math.log(math.expm1(max(log_std - MIN_LOG_STD, 1e-3)))
         with torch.no_grad():
             self.policy.head.raw_log_std.fill_(raw)
-        self._first_spread = self.policy.spread.numpy().copy()
+            spread = floored_log_std(self.policy.head.raw_log_std).exp() * self.policy.free
+        self._first_spread = spread.numpy()
 
     @torch.no_grad()
     def collect(self, seed: int) -> Transitions:

@@ -31,7 +31,6 @@ from manip_il.cli.outputs import publish
 from manip_il.cli.progress import progress, say
 from manip_il.data.atomic import write_file, write_json
 from manip_il.data.dataset import Dataset
-from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import find_policy
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.seeding import rng_for, stream_base
@@ -55,7 +54,7 @@ def run_ask(options: AskOptions) -> None:
     clips = read_clips(Pairs.read(options.pairs), find_datasets(options.sources))
     with progress(len(clips.pairs), "render") as bar:
         films = render_films(clips, options.robot, bar.step)
-    page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
+    page = render_page(clips.pairs, clips.data.spec.instruction, films)
     write_file(options.output, page.encode())
     say(f"{len(clips.pairs):,} pairs: {options.output}")
 
@@ -76,14 +75,14 @@ def run_fit(options: FitOptions) -> None:
     answers = join_answers([Preferences.read(path, pairs) for path in options.answers])
     clips = read_clips(join_pairs(pairs), find_datasets(options.sources))
     with progress(None, f"fit {len(answers.better):,} answers") as bar:
-        shape = shape_for(clips.frames[0].spec, options.members)
+        shape = shape_for(clips.data.spec, options.members)
         found = fit_answers(clips, answers, shape, stream_base("training", options.seed), bar.step)
     fingerprint = Dataset.open(clips.roots[0]).fingerprint
     stored = {"seed": options.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.clip}
     with options.open() as folder:
         target = folder / PRETRAINED_MODEL
         target.mkdir(parents=True, exist_ok=True)
-        write_reward(target, found.network, clips.frames[0].spec, stored, fingerprint)
+        write_reward(target, found.network, clips.data.spec, stored, fingerprint)
         write_json(folder / "fit.json", found.to_json())
     say(*summary_lines(found, answers), f"reward: {folder}")
 
@@ -112,14 +111,12 @@ PROGRESS = "progress"  # value of --reward: score by true progress
 def run_score(options: ScoreOptions) -> None:
     """Score, print the worst episodes, write the files."""
     data = read_frames(options.dataset)
-    if options.reward != PROGRESS:
+    if options.reward == PROGRESS:
+        found = data.progress
+    else:
         reward = LearnedReward.load(find_policy(Path(options.reward).expanduser()))
         reward.check_fits(str(options.dataset), data.spec)
         found = reward(data.inputs).astype("float64").clip(0.0, 1.0)
-    elif data.progress is not None:
-        found = data.progress
-    else:
-        raise ManipError(f"{options.dataset} has no progress column; give --reward=FOLDER")
     scores = scoring.Scores(str(options.dataset), options.reward, data, found)
     with options.open(Path(options.reward).expanduser()) as folder:
         scoring.write_weights(folder / scoring.WEIGHTS_FILE, scores)
