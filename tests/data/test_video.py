@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from manip_il.bridges.doctor.examine import examine_folder, has_errors
+from manip_il.bridges.doctor.examine import examine_folder
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import merge_datasets
@@ -85,7 +85,7 @@ def test_a_rate_that_is_not_whole_is_that_of_rows_videos_and_policies(filmed, tw
     theirs: Any = LeRobotDataset("local/lift", root=root)
     pictures = np.stack([255 * theirs[row][FRONT].numpy().transpose(1, 2, 0) for row in range(21)])
     assert numbers_of(pictures) == list(range(21))
-    assert not has_errors(examine_folder(root))
+    assert not [one for one in examine_folder(root) if one.is_error]
     (root / layout.OURS).unlink()
     assert Origin.of(Dataset.open(root).spec).fps == fps
 
@@ -127,7 +127,7 @@ def test_an_encoder_makes_no_thread_a_real_time_one():
 def test_datasets_with_cameras_become_one_with_the_same_pictures(tmp_path, root):
     info = merge_datasets([root, root], tmp_path / "merged", provenance={"made": "here"})
     assert (info.episodes, info.frames) == (6, 42)
-    assert not has_errors(examine_folder(tmp_path / "merged"))
+    assert not [one for one in examine_folder(tmp_path / "merged") if one.is_error]
     assert Dataset.open(tmp_path / "merged").spec == Dataset.open(root).spec
     assert Dataset.open(tmp_path / "merged").provenance["made"] == "here"
     for camera in (FRONT, WRIST):
