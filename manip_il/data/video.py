@@ -5,10 +5,9 @@ settings are copied here (and tests compare the two), because importing `lerobot
 imports torch, which takes seconds.
 """
 
-import itertools
 import os
 import shutil
-from contextlib import closing, suppress
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,8 @@ from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.camera import FrameRange, Pictures, open_video
+from manip_il.data.camera import Pictures
 from manip_il.data.dataset import EpisodeData
-from manip_il.data.info import reading
 from manip_il.data.schema import exact_rate
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import UsageError
@@ -60,22 +58,19 @@ class CameraFiles:
         self.size: tuple[int, int] | None = None
 
     def copy(self, episode: EpisodeData) -> dict[str, Any]:
-        """Copy the video file that holds an episode, unless already copied.
+        """Copy the whole video file that holds an episode, unless already copied.
 
         Return the columns of its row.
         """
         film = episode.films[self._key]
         source = episode.dataset, film.path
-        if episode.cut or source not in self._copied:
+        if source not in self._copied:
             self.close()
             path, self._copied[source] = self._next_file()
-            if episode.cut:
-                _cut(film, path, self._fps)
-            else:
-                with checks.native_path(film.path, "an MP4 file") as opened:
-                    shutil.copyfile(opened, path)
+            with checks.native_path(film.path, "an MP4 file") as opened:
+                shutil.copyfile(opened, path)
             self._number += 1
-        return self._copied[source] | self._times(0 if episode.cut else film.first, film.count)
+        return self._copied[source] | self._times(film.first, film.count)
 
     def write(self, frames: Pictures) -> dict[str, Any]:
         """Append the frames of an episode; return the columns of its row.
@@ -157,40 +152,6 @@ class CameraFiles:
             packet.stream = self._stream
             self._bytes += packet.size
             self._container.mux_one(packet)
-
-
-def _cut(film: FrameRange, target: Path, fps: float) -> None:
-    """Copy frames of a video file as they are encoded.
-
-    Raises `ManipError` if they need frames before them.
-    """
-    with (
-        reading(film.path),
-        closing(open_video(film.path)) as source,
-        av.open(str(target), "w", options=_OPTIONS) as container,
-    ):
-        stream = source.streams.video[0]
-        own = container.add_stream_from_template(stream, opaque=True)
-        rate = fps * float(stream.time_base or 1)  # [frames/tick]
-        # to the last key frame at or before it
-        source.seek(round(film.first / rate), stream=stream)
-        inside = (
-            packet
-            for packet in source.demux(stream)
-            if packet.size and 0 <= round((packet.pts or 0) * rate) - film.first < film.count
-        )
-        packets: list[Any] = [*itertools.islice(inside, film.count)]
-        if len(packets) != film.count or not packets[0].is_keyframe:
-            last = film.first + film.count - 1
-            raise ValueError(
-                f"frames {film.first} to {last} cannot be cut out without encoding them again"
-            )
-        start = packets[0].pts or 0
-        for packet in packets:
-            packet.pts = (packet.pts or 0) - start
-            packet.dts = (packet.dts or 0) - start
-            packet.stream = own
-            container.mux_one(packet)
 
 
 def _encode(encoder: Any, frame: av.VideoFrame | None) -> list[Any]:
