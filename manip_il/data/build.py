@@ -17,7 +17,7 @@ import numpy as np
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import write_json
-from manip_il.data.dataset import Dataset, EpisodeData, Own
+from manip_il.data.dataset import Dataset, Own
 from manip_il.data.episodes import parts
 from manip_il.data.fingerprint import compare_fingerprints, file_sha256
 from manip_il.data.info import PICTURES, Info, reading
@@ -227,17 +227,11 @@ def merge_datasets(
             if features.setdefault(key, feature)["dtype"] == "image":
                 features[key] = feature
 
-    def chosen() -> Iterator[EpisodeData]:
-        before = 0
-        for dataset in opened:
-            for one in dataset.stored_episodes(renamed=names):
-                if before + one.number in kept:
-                    yield one
-            before += dataset.info.episodes
-
+    stored = itertools.chain.from_iterable(one.stored_episodes(renamed=names) for one in opened)
+    chosen = (one for number, one in enumerate(stored) if number in kept)
     about = opened[0].fps, opened[0].info.robot, own
     return write_episodes(
-        chosen(), root, features, *about, tables=opened[0].other_tables, replace=replace
+        chosen, root, features, *about, tables=opened[0].other_tables, replace=replace
     )
 
 

@@ -69,17 +69,13 @@ class EpisodeData:
             Arrow arrays.
         tasks: The text of every frame.
         others: Values in the columns of `meta/episodes` that LeRobot does not have.
-        dataset: Where it is stored.
-        number: Its number there.
-        films: Its frames in the films of each camera there.
+        films: Its frames in the stored films of each camera.
         picture_statistics: Stored statistics of its pictures, by camera.
     """
 
     columns: Mapping[str, Column]
     tasks: Sequence[str]
     others: Mapping[str, Any] = field(default_factory=dict)
-    dataset: Dataset | None = None
-    number: int = 0
     films: Mapping[str, FrameRange] = field(default_factory=dict)
     picture_statistics: Statistics = field(default_factory=dict)
 
@@ -365,8 +361,6 @@ class Dataset:
                     columns={new[name]: column[rows] for name, column in columns.items()},
                     tasks=texts[rows],
                     others=undrawn | table.others[place],
-                    dataset=self,
-                    number=int(table.index[place]),
                     films={new[key]: ranges[place] for key, ranges in films.items()},
                     picture_statistics={new[key]: one for key, one in statistics[place].items()},
                 )

@@ -54,7 +54,7 @@ class CameraFiles:
         self._bytes = 0
         self._container: Any = None  # the open file
         self._stream: Any = None
-        self._copied: dict[Any, dict[str, Any]] = {}  # source -> its place in the new dataset
+        self._copied: dict[Path, dict[str, Any]] = {}  # source -> its place in the new dataset
         self.size: tuple[int, int] | None = None
 
     def copy(self, episode: EpisodeData) -> dict[str, Any]:
@@ -63,14 +63,13 @@ class CameraFiles:
         Return the columns of its row.
         """
         film = episode.films[self._key]
-        source = episode.dataset, film.path
-        if source not in self._copied:
+        if film.path not in self._copied:
             self.close()
-            path, self._copied[source] = self._next_file()
+            path, self._copied[film.path] = self._next_file()
             with checks.native_path(film.path, "an MP4 file") as opened:
                 shutil.copyfile(opened, path)
             self._number += 1
-        return self._copied[source] | self._times(film.first, film.count)
+        return self._copied[film.path] | self._times(film.first, film.count)
 
     def write(self, frames: Pictures) -> dict[str, Any]:
         """Append the frames of an episode; return the columns of its row.
