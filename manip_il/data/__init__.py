@@ -10,7 +10,8 @@ edited or imported, is one call of `write_episodes` with other `EpisodeData`. `b
 episodes of rollouts (as they arrive, or from a folder of journals) and merges datasets.
 `dataset.py` opens any LeRobot dataset, or several as one: `info.py` and `parquet_files.py` parse
 its `meta/` and columns, `camera.py` decodes its pictures, `statistics.py` computes and reads
-statistics. `lerobot_layout.py` has LeRobot's paths and Arrow types, `video.py` writes videos. `gate.py` opens untrusted files in a child process.
+statistics. `lerobot_layout.py` has LeRobot's paths and Arrow types, `video.py` writes videos.
+`gate.py` opens untrusted files in a child process.
 
 Guarantees:
 
