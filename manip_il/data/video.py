@@ -74,24 +74,26 @@ class CameraFiles:
     def write(self, frames: Pictures) -> dict[str, Any]:
         """Append the frames of an episode; return the columns of its row.
 
-        Raises `av.FFmpegError` if they cannot be encoded or written.
+        Raises `UsageError` if the encoder refuses its settings, and `av.FFmpegError` if the frames
+        cannot be written.
         """
         if self._bytes >= layout.VIDEO_FILES_SIZE_IN_MB * 2**20:
             self.close()
         path, place = self._next_file()
         self.size = size = frames.shape[1], frames.shape[2]
+        encoder: Any
         if self._container is None:
             self._container = av.open(str(path), "w", options=_OPTIONS)
             self._stream = self._container.add_stream(self._config.vcodec, self._rate)
             encoder = self._stream.codec_context
         else:  # a new encoder, so that its bytes do not depend on other episodes
             encoder = av.CodecContext.create(self._config.vcodec, "w")
-        _set_up(encoder, self._config, size, self._rate)
+        _open(encoder, self._config, size, self._rate)
         times = self._times(self._frames, len(frames))
         for picture in frames:
-            self._mux(_encode(encoder, _video_frame(picture, self._frames, self._rate)))
+            self._mux(encoder.encode(_video_frame(picture, self._frames, self._rate)))
             self._frames += 1
-        self._mux(_encode(encoder, None))
+        self._mux(encoder.encode(None))
         return place | times
 
     def close(self) -> None:
@@ -153,57 +155,34 @@ class CameraFiles:
             self._container.mux_one(packet)
 
 
-def _encode(encoder: Any, frame: av.VideoFrame | None) -> list[Any]:
-    """Encode a frame, or None to flush; the first one opens the encoder.
+def _open(encoder: Any, config: VideoConfig, size: tuple[int, int], rate: Fraction) -> None:
+    """Open an encoder. Raises `UsageError` if it refuses its settings.
 
     If run by root, SVT-AV1 permanently gives real-time priority (SCHED_FIFO) to the calling thread
     and to its worker threads, which with their child processes would starve all other processes.
     This undoes it.
     """
-    opens = not encoder.is_open
-    packets = encoder.encode(frame)
-    if opens and os.geteuid() == 0 and encoder.name == "libsvtav1":
-        for thread in map(int, os.listdir("/proc/self/task")):
-            with suppress(OSError):  # the thread has ended
-                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
-    return packets
-
-
-def _set_up(encoder: Any, config: VideoConfig, size: tuple[int, int], rate: Fraction) -> None:
     # errors only; otherwise it prints its version for every encoder
     os.environ.setdefault("SVT_LOG", "1")
     encoder.options = config.options()
     encoder.height, encoder.width = size
-    encoder.pix_fmt = config.pix_fmt
     encoder.framerate = rate
     encoder.time_base = 1 / rate
+    try:
+        encoder.pix_fmt = config.pix_fmt
+        encoder.open()
+    except (av.FFmpegError, ValueError) as error:
+        expected = f"expected even sizes and settings of {config.vcodec}"
+        raise UsageError(
+            f"cannot encode {size[1]} x {size[0]} pictures with {config}: {error}; {expected}"
+        ) from error
+    if os.geteuid() == 0 and encoder.name == "libsvtav1":
+        for thread in map(int, os.listdir("/proc/self/task")):
+            with suppress(OSError):  # the thread has ended
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _video_frame(picture: NDArray[np.uint8], number: int, rate: Fraction) -> av.VideoFrame:
     frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
     frame.pts, frame.time_base = number, 1 / rate
     return frame
-
-
-def try_encoder(config: VideoConfig, size: tuple[int, int], fps: float) -> None:
-    """Encode one black picture, to find out whether the encoder accepts its settings.
-
-    Args:
-        config: Settings of the encoder.
-        size: Height and width of the picture [pixels].
-        fps: Rate of the video [frames/s].
-
-    Raises:
-        UsageError: if the picture cannot be encoded.
-    """
-    rate = exact_rate(fps)
-    try:
-        encoder = av.CodecContext.create(config.vcodec, "w")
-        _set_up(encoder, config, size, rate)
-        _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, rate))
-        _encode(encoder, None)
-    except (av.FFmpegError, ValueError) as error:
-        expected = f"expected even sizes and settings of {config.vcodec}"
-        raise UsageError(
-            f"cannot encode {size[1]} x {size[0]} pictures with {config}: {error}; {expected}"
-        ) from error

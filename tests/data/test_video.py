@@ -18,9 +18,8 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
-from manip_il.data.video import try_encoder
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import UnknownName
+from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.checkpoint import Origin
 from manip_il.mdp import Episode
 
@@ -117,8 +116,14 @@ def test_statistics_of_pictures_are_those_of_every_pixel(root, filmed):
         np.testing.assert_allclose(np.ravel(stats[name]), values, rtol=1e-10, err_msg=name)
 
 
-def test_an_encoder_makes_no_thread_a_real_time_one():
-    try_encoder(VideoConfig(vcodec="libsvtav1"), (64, 64), 10)
+def test_settings_that_an_encoder_refuses_are_one_line(filmed, two, tmp_path):
+    with pytest.raises(UsageError, match=r"cannot encode 96 x 72 pictures .*expected even"):
+        write(filmed, tmp_path / "odd", two, video=VideoConfig(preset="slowest"))
+    assert not (tmp_path / "odd").exists()
+
+
+def test_an_encoder_makes_no_thread_a_real_time_one(filmed, two, tmp_path):
+    write(filmed, tmp_path / "lift", two, video=VideoConfig(vcodec="libsvtav1"))
     assert {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")} == {
         os.SCHED_OTHER
     }
