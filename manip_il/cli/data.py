@@ -168,9 +168,7 @@ class CheckOptions(OfDataset):
 
 @dataclass(frozen=True)
 class RepairOptions(CheckOptions):
-    """Rebuild a dataset from its journals.
-
-    Without them recompute counts and statistics, and move leftover files away.
+    """Compute a dataset's counts and statistics again if they are wrong.
 
     Replaced files are kept in DATASET.before-repair. Then the dataset is checked again.
 

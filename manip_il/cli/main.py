@@ -54,7 +54,7 @@ COMMANDS = {
         "compare the proven bounds of cloning and DAgger with a run",
     ),
     "data check": ("data:CheckOptions", "find errors in any LeRobot dataset"),
-    "data repair": ("data:RepairOptions", "repair a dataset, from its journals or its own data"),
+    "data repair": ("data:RepairOptions", "compute wrong counts and statistics of a dataset again"),
     "data render": (
         "data:RenderOptions",
         "render a dataset again, with other cameras, sizes or lights",
