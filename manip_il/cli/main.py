@@ -18,7 +18,7 @@ from typing import Any
 from manip_il import __version__
 from manip_il.bridges.store.errors import redact
 from manip_il.cli import progress
-from manip_il.cli.parsing import Option, check_paths, metavar, options_of, parse, word
+from manip_il.cli.parsing import Option, metavar, options_of, parse, word
 from manip_il.errors import ManipError, UnknownName, printable, silence_ffmpeg_warning, told
 
 PROGRAM = "manip-il"
@@ -160,7 +160,6 @@ def _dispatch(own: list[str], others: list[str]) -> None:
         print(_command_help(name, load(name), words))
     else:
         options = parse(load(name), [*words, *others], command=name)
-        check_paths(options)
         silence_ffmpeg_warning()
         run(name, options)
 

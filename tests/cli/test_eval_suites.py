@@ -108,7 +108,7 @@ def test_until_width_stops_early(here, capsys, error):
         "--env.horizon=5",
         "--eval.n_episodes=300",
     ]
-    assert evaluate("e", *words, "--until-width=0.1") == 0
+    assert evaluate("e", *words, "--until_width=0.1") == 0
     result = EvalResult.read(Path("e"))
     assert (len(result.episodes), result.until_width) == (100, 0.1)
     low, high = result.success.interval
@@ -190,7 +190,7 @@ def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys, error):
     assert "success was True, is False" in line
     assert "return was 3.0, is 0.0" in line
     assert main(["eval", "e", "--replay=4000001", f"--policy.path={act}"]) == 1
-    assert "what is drawn for the episode differs" in error()
+    assert "drawn was " in error()
     assert main(["eval", "e", "--replay=2"]) == 2
     assert "has seeds 4000000 to 4000001" in error()
 

@@ -73,6 +73,10 @@ def fails(words: list[str], cls: type = Options) -> str:
         (["--lr=-1e-4"], {"lr": -1e-4}),
         (["--resume", "--loss=l1"], {"resume": True, "loss": "l1"}),
         (["--loss=l1", "--loss=mse"], {}),
+        (
+            ["--lr", "-1e-4", "--resume", "true", "--loss", "l1"],
+            {"lr": -1e-4, "resume": True, "loss": "l1"},
+        ),
     ],
 )
 def test_words_change_what_they_name(words, change):
@@ -91,14 +95,14 @@ def test_words_change_what_they_name(words, change):
             ],
         ),
         (
-            ["--repo-id=x"],
-            ["unknown option '--repo-id' (did you mean '--small.repo_id' or '--dataset.repo_id'?)"],
+            ["--repo_id=x"],
+            ["unknown option '--repo_id' (did you mean '--small.repo_id' or '--dataset.repo_id'?)"],
         ),
         (["--dataset=x"], ["unknown option '--dataset' (did you mean '--dataset.root'"]),
         (["--lr=fast"], ["--lr", "expected FLOAT", "'fast'"]),
         (["--dataset.num_episodes=1.5"], ["--dataset.num_episodes", "expected INT", "'1.5'"]),
         (["--loss=mze"], ["expected mse|l1", "'mze'"]),
-        (["--lr", "1"], ["--lr has no value; write --lr=VALUE"]),
+        (["--lr", "--resume"], ["--lr has no value; write --lr=VALUE"]),
         (["--resume=yes"], ["expected true|false", "'yes'"]),
         (["--gains=1,x"], ["expected FLOAT,..."]),
     ],

@@ -55,7 +55,7 @@ def test_without_opengl_the_page_says_so(own: Path, tmp_path: Path, no_opengl: N
     )
     said = capsys.readouterr()
     assert "own has starts for 1 of 1 tasks; the expert was not run." in said.out
-    page, found = (out / "check.html").read_text(), json.loads((out / "check.json").read_text())
+    page, found = (out / "report.html").read_text(), json.loads((out / "check.json").read_text())
     assert "No pictures: no off-screen OpenGL" in page
     facts = {"task": "reach", "done": True, "starts": 50, "refused": ""}
     assert found["tasks"] == [facts | {"clean": None, "noisy": None}]
@@ -81,7 +81,7 @@ def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_op
     )
     assert "change: lift: task lift: 'object' is 0.050 m wide" in said.out
     assert "cannot do 1 of 2 tasks: lift" in said.err
-    assert (out / "check.html").is_file()
+    assert (out / "report.html").is_file()
 
 
 def test_parts_that_overlap_at_home_are_named_with_their_depth(
@@ -117,5 +117,5 @@ def test_the_page_of_an_arm_has_pictures_and_episodes(own: Path, tmp_path: Path,
         == 0
     )
     assert "| 50 of 50 | 100" in capsys.readouterr().out.replace("  ", " ")
-    assert "The arm at home in its scene" in (out / "check.html").read_text()
+    assert "The arm at home in its scene" in (out / "report.html").read_text()
     assert json.loads((out / "check.json").read_text())["tasks"][0]["clean"]["success_rate"] == 1

@@ -121,7 +121,7 @@ def run_score(options: ScoreOptions) -> None:
     else:
         raise ManipError(f"{options.dataset} has no progress column; give --reward=FOLDER")
     scores = scoring.Scores(str(options.dataset), options.reward, data, found)
-    with options.open(Path(options.reward).expanduser()) as folder:
+    with options.open() as folder:
         scoring.write_weights(folder / scoring.WEIGHTS_FILE, scores)
         worst = [scoring.worst_table(scores)]
         publish(folder / scoring.FILE_NAME, scores.to_json(), worst, *scoring.fact_lines(scores))
