@@ -157,17 +157,13 @@ def prepare_output(
 
     Args:
         kinds: Folder -> the kind of folder that may be replaced, as `kind_of` names it.
-        resume: Whether to continue with what is there.
+        resume: Whether to continue with what is there; then nothing of it is deleted.
         overwrite: Whether to delete what is there.
         sources: Input paths, which must not be replaced.
 
     Raises:
-        UsageError: what `require_writable` raises, and for options that contradict each other.
+        UsageError: what `require_writable` raises.
     """
-    if resume and overwrite:
-        raise UsageError(
-            "--resume=true and --overwrite=true contradict each other; give one of them"
-        )
     for folder, kind in () if resume else kinds.items():  # all of them, before one is emptied
         require_writable(folder, kind, overwrite, sources)
     for folder in kinds:

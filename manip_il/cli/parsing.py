@@ -331,7 +331,7 @@ def from_layers[T](
     for name, one in (raw | dict(words or {})).items():
         option = one.option
         # other nulls mean the default
-        if one.value is not None or without_none(option.type) != option.type:
+        if option.is_open or one.value is not None or without_none(option.type) != option.type:
             own = (name.removeprefix(f"{option.name}."),) if option.is_open else ()
             _put(changes, option.path + own, _decode(one))
             known.pop(name, None)

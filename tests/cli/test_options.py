@@ -238,14 +238,3 @@ def test_of_layers_the_later_one_counts():
     )
     assert fit == Fit({"width": 16, "depth": 1}, Dataset("a/b", num_episodes=7), 5)
     assert from_layers(Fit, []) == Fit()
-
-
-def test_a_layers_error_says_which_layer():
-    with pytest.raises(
-        UsageError, match=r"unknown key in x.yaml: arms.a: 'stepps' \(did you mean 'steps'\?\)"
-    ):
-        from_layers(Fit, [("x.yaml: common", {"steps": 3}), ("x.yaml: arms.a", {"stepps": 3})])
-    with pytest.raises(
-        UsageError, match=r"x.yaml: arms.a: data.num_episodes: expected INT, got 'many'"
-    ):
-        from_layers(Fit, [("x.yaml: arms.a", {"data": {"num_episodes": "many"}})])

@@ -192,10 +192,11 @@ def _measure(
         Side(name, (Member(Path(name), policy=path),), colour, n)
         for name, path, n, colour in contestants
     ]
+    envs = dict.fromkeys((side.name for side in sides), config.env)
     nominal, disturbed = (
         measure_sides(
             sides,
-            {side.name: config.env for side in sides},
+            envs,
             folder / suite,
             episodes=count,
             suite=suite,

@@ -28,7 +28,7 @@ from manip_il.tasks import NAMES
 from manip_il.tasks.table import get_task
 
 
-def run_robot_new(options: RobotNewOptions) -> None:
+def run_new(options: RobotNewOptions) -> None:
     """Write the YAML file, check the robot, print what is left to do.
 
     Raises `ManipError` if it can do no task.
@@ -50,7 +50,7 @@ def run_robot_new(options: RobotNewOptions) -> None:
         raise ManipError(f"{target} cannot do any task yet; see above")
 
 
-def run_robot_check(options: RobotCheckOptions) -> None:
+def run_check(options: RobotCheckOptions) -> None:
     """Measure, print the tables, write the report. Raises `ManipError` if a task cannot be done."""
     # raises, before anything is written, if the robot cannot be used
     sweep(get_robot(options.robot))
