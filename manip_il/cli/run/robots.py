@@ -1,15 +1,14 @@
 """Run `manip-il robot new`, `check`, `certify`."""
 
 import os
-from dataclasses import replace
 
 from manip_il import checks
-from manip_il.cli.outputs import OutputFile, about, publish
+from manip_il.cli.outputs import OutputFile, publish
 from manip_il.cli.progress import progress, say
 from manip_il.cli.robots import CertifyOptions, RobotCheckOptions, RobotNewOptions
 from manip_il.collect.inputs import env_config
 from manip_il.collect.workers import Engine
-from manip_il.data.atomic import write_file, write_json
+from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError
 from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
 from manip_il.evaluation.robot_check import FILE_NAME as CHECK_FILE
@@ -17,7 +16,6 @@ from manip_il.evaluation.robot_check import (
     advice,
     check_report,
     check_robot,
-    task_table,
     verdict,
 )
 from manip_il.progress import Progress
@@ -63,11 +61,16 @@ def run_check(options: RobotCheckOptions) -> None:
             Engine(None) as engine,
         ):
             found = check_robot(options.robot, tasks, options.episodes, engine, bar)
-        write_json(folder / CHECK_FILE, found.to_json())
-        page = replace(check_report(found), **about(options)).write(folder)
-    task_table(found).print()
-    say(verdict(found), *(f"change: {line}" for line in advice(found)))
-    say(f"page: {page}")
+        page = check_report(found)
+        publish(
+            folder / CHECK_FILE,
+            found.to_json(),
+            page.sections[0].tables,
+            page.verdict,
+            *(f"change: {line}" for line in page.facts),
+            page=page,
+            options=options,
+        )
     if found.failed:
         names = ", ".join(task.name for task in found.failed)
         raise ManipError(
