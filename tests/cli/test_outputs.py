@@ -148,7 +148,6 @@ def test_overwrite_spares_what_is_read_and_follows_no_link(ours, tmp_path):
     with pytest.raises(UsageError, match="overlaps"):
         prepare_output({ours: EVALUATION}, overwrite=True, sources=[ours / "inside"])
     (ours / "dagger").mkdir()
-    assert run(f"theory {ours / 'dagger'} --output_dir={ours} --overwrite=true") == 2
     assert run(f"data build {ours} {ours} --overwrite=true") == 2
     (ours / "mine.yaml").write_text("joint_noise: 0.1\n")
     assert (
