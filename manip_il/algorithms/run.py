@@ -48,7 +48,7 @@ from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import METRICS_FILE
-from manip_il.evaluation.runner import evaluate
+from manip_il.evaluation.runner import measure
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.progress import Progress
 from manip_il.seeding import stream_seeds
@@ -270,7 +270,7 @@ class Run:
                 return EvalResult.read(path)
             suite = job.conditions[0].name if job.conditions else NOMINAL.name
             seeds = stream_seeds("validation", self.config.validation_episodes, self.config.seed)
-            found = evaluate(self._engine, job, seeds, name, self._progress.episode, suite=suite)
+            found = measure(self._engine, job, seeds, name, self._progress, suite=suite)
             found.write(path)
             return found
 

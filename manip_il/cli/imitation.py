@@ -52,7 +52,6 @@ class TrainOptions(Seeded, Trusting, ResumableOutput):
     weights: Path | None = option(
         None,
         "rabc.parquet from manip-il data score: sampling weights of frames, as in LeRobot's RA-BC",
-        exists="",
     )
     fit: Given = given(FitConfig, prefix="")
     output_dir: Path = output_folder("runs/train")

@@ -142,7 +142,10 @@ def read_info(root: Path) -> Info:
     """
     path = root / layout.INFO
     if not path.exists():
-        raise ManipError(f"{root} is not a LeRobot dataset: {layout.INFO} is missing")
+        raise ManipError(
+            f"{root} is not a LeRobot dataset: {layout.INFO} is missing; one on the Hub must be"
+            " pulled first: manip-il pull hf://datasets/USER/NAME FOLDER"
+        )
     raw = checks.read_json(path, "a dataset's description")
     version = raw.get("codebase_version")
     if version != layout.VERSION:

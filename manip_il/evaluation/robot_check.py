@@ -2,7 +2,7 @@
 expert on every task.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,11 +15,12 @@ from manip_il.collect.workers import Engine
 from manip_il.errors import RenderError, UsageError
 from manip_il.evaluation.figures import INK, Figure, drawing, to_figure
 from manip_il.evaluation.report import Report, Section
-from manip_il.evaluation.results import EpisodeResult, EvalResult
-from manip_il.evaluation.runner import evaluate
+from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.runner import measure
 from manip_il.evaluation.suites import read_condition
 from manip_il.evaluation.tables import CLONING, EXPERT, INTERVAL, Table
 from manip_il.option import NameOrPath
+from manip_il.progress import Progress
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
@@ -115,7 +116,7 @@ def check_robot(
     tasks: Sequence[str],
     episodes: int,
     engine: Engine,
-    on_result: Callable[[EpisodeResult], object],
+    progress: Progress,
 ) -> RobotCheck:
     """Measure a robot on tasks.
 
@@ -124,7 +125,7 @@ def check_robot(
         tasks: Names of tasks.
         episodes: Episodes per task without random actions, and as many with.
         engine: What runs them.
-        on_result: Called with every episode's result as it ends.
+        progress: Follows the episodes.
 
     Raises:
         UsageError: If the robot itself cannot be used.
@@ -139,9 +140,7 @@ def check_robot(
                     make_config(name, task.name), hold=HOLD, label="last", conditions=(condition,)
                 )
                 seeds = stream_seeds("validation", episodes)
-                found.append(
-                    evaluate(engine, job, seeds, "expert", on_result, suite=condition.name)
-                )
+                found.append(measure(engine, job, seeds, "expert", progress, suite=condition.name))
             checked[place] = replace(task, clean=found[0], noisy=found[1])
     table = float(_reached(robot, robot.workspace.half_width, 41).mean())
     return RobotCheck(name, robot, scene.gripper.most, table, tuple(checked))

@@ -13,7 +13,7 @@ from manip_il.data.journal import Journal
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..damage import edit_json
-from .made_runs import make_episode
+from .made_runs import make_episode, run
 
 ENV = make_config("panda", "reach", 20)
 
@@ -29,13 +29,13 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_a_whole_dataset_exits_0_with_one_line(root, capsys):
-    assert main(["data", "check", str(root)]) == 0
+    assert run(f"data check {root}") == 0
     assert capsys.readouterr().out == f"{root}: 2 episodes, 12 frames: whole; warnings: 0\n"
 
 
 def test_an_error_exits_1_and_a_warning_0(root, capsys, monkeypatch):
     (root / layout.STATS).unlink()
-    assert main(["data", "check", str(root)]) == 0
+    assert run(f"data check {root}") == 0
     assert (
         capsys.readouterr().out.splitlines()[-1]
         == f"{root}: 2 episodes, 12 frames: whole; warnings: 1"
@@ -52,29 +52,29 @@ def test_an_error_exits_1_and_a_warning_0(root, capsys, monkeypatch):
 
 def test_repair_exits_0_or_1_if_something_stays_wrong(root, capsys):
     edit_json(root / layout.INFO, lambda info: info.update(total_tasks=3))
-    assert main(["data", "repair", str(root)]) == 0
+    assert run(f"data repair {root}") == 0
     out = capsys.readouterr().out.splitlines()
     assert "repair   computed from the data: meta/info.json" in out
     assert out[-1] == f"{root}: 2 episodes, 12 frames: whole; warnings: 0"
     root.with_name("d.before-repair").rename(root.with_name("kept"))
     (root / layout.TASKS).unlink()
-    assert main(["data", "repair", str(root)]) == 1
+    assert run(f"data repair {root}") == 1
     assert "these cannot be repaired" in capsys.readouterr().err
 
 
 def test_the_robots_joints_are_compared(root, capsys):
     edit_json(root / layout.OURS, lambda ours: ours["fingerprint"].update(model_sha256="0" * 64))
-    assert main(["data", "check", str(root)]) == 0
+    assert run(f"data check {root}") == 0
     out = capsys.readouterr().out
     assert f"warning  meta/manip_il.json: model_sha256 differs: {root} has 000000000000" in out
     edit_json(root / layout.OURS, lambda ours: ours["spec"]["joint_names"].__setitem__(0, "elbow"))
-    assert main(["data", "check", str(root)]) == 1
+    assert run(f"data check {root}") == 1
     assert "error    meta/manip_il.json: joint_names differs: " in capsys.readouterr().out
 
 
 def test_two_datasets_become_one_with_the_episodes_of_both(root, capsys):
     other = shutil.copytree(root, root.with_name("other"))
-    words = ["data", "merge", str(root), str(other), f"--output={root.with_name('both')}"]
+    words = f"data merge {root} {other} --output={root.with_name('both')}".split()
     assert main(words) == 0
     assert Dataset.open(root.with_name("both")).info.episodes == 4
     assert main(words) == 2

@@ -62,8 +62,8 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(
     words = ["--env.horizon=8", "--workers=1", out]
     for command in (
         ["eval", f"--policy.path={hostile}", "--eval.n_episodes=1", *words],
-        ["compare", str(policy), str(hostile), "--eval.n_episodes=1", *words],
-        ["eval", str(file), "--replay=4000000", f"--policy.path={hostile}"],
+        [*f"compare {policy} {hostile} --eval.n_episodes=1".split(), *words],
+        f"eval {file} --replay=4000000 --policy.path={hostile}".split(),
         ["dagger", f"--policy.path={named}", out],
         ["dagger", "--policy.type=gaussian_actor", "--policy.vision_encoder_name=evil/x", out],
     ):

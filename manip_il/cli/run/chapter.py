@@ -3,8 +3,12 @@
 Run `manip-il reward irl`: learn a reward from demonstrations.
 
 Run `manip-il data score`: score a dataset's episodes by a reward.
+
+Run `manip-il theory`: the proven bounds of cloning and DAgger, on small MDPs and on the rounds of a
+run.
 """
 
+from itertools import chain
 from pathlib import Path
 
 from manip_il.chapter import inverse
@@ -25,12 +29,25 @@ from manip_il.chapter.preferences.pairs import (
     read_frames,
 )
 from manip_il.chapter.reward import LearnedReward, shape_for, write_reward
-from manip_il.cli.chapter import AnswerOptions, AskOptions, FitOptions, IrlOptions, PairsOptions
+from manip_il.chapter.theory.bounds import PROCESSES, curves
+from manip_il.chapter.theory.linear import drifts
+from manip_il.chapter.theory.report import FILE_NAME, Theory, slope_table, theory_report
+from manip_il.chapter.theory.shift import RoundData, Shift, find_rounds, measure_shift
+from manip_il.cli.chapter import (
+    AnswerOptions,
+    AskOptions,
+    FitOptions,
+    IrlOptions,
+    PairsOptions,
+    TheoryOptions,
+)
 from manip_il.cli.data import ScoreOptions
 from manip_il.cli.outputs import publish
 from manip_il.cli.progress import progress, say
 from manip_il.data.atomic import write_file, write_json
 from manip_il.data.dataset import Dataset
+from manip_il.evaluation.certify import certify, count_episodes
+from manip_il.evaluation.side import read_member
 from manip_il.learn.checkpoint import find_policy
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.seeding import rng_for, stream_base
@@ -118,7 +135,37 @@ def run_score(options: ScoreOptions) -> None:
         reward.check_fits(str(options.dataset), data.spec)
         found = reward(data.inputs).astype("float64").clip(0.0, 1.0)
     scores = scoring.Scores(str(options.dataset), options.reward, data, found)
-    with options.open(Path(options.reward).expanduser()) as folder:
+    with options.open() as folder:
         scoring.write_weights(folder / scoring.WEIGHTS_FILE, scores)
         worst = [scoring.worst_table(scores)]
         publish(folder / scoring.FILE_NAME, scores.to_json(), worst, *scoring.fact_lines(scores))
+
+
+def run_theory(options: TheoryOptions) -> None:
+    """Compute and measure; write the report and the JSON file; print the slopes."""
+    rounds = find_rounds(options.source) if options.source else []
+    with options.open() as folder:
+        shift = _shift(options, options.source, rounds) if options.source else None
+        theory = Theory(tuple(chain(*map(curves, PROCESSES))), tuple(drifts()), shift)
+        page = theory_report(theory)
+        fact = f"policies above their bound: {theory.above}"
+        publish(
+            folder / FILE_NAME,
+            theory.to_json(),
+            [slope_table(theory)],
+            fact,
+            page=page,
+            options=options,
+        )
+
+
+def _shift(options: TheoryOptions, run: Path, rounds: list[RoundData]) -> Shift:
+    validation = read_member(run).validation
+    env = validation.env()
+    count = count_episodes(env, options.cases) + options.episodes * (1 + len(rounds))
+    with progress(count, f"theory {run}") as bar, options.open_engine() as engine:
+        certificate = certify(engine, env, options.cases, on_episode=lambda _: bar.step())
+        u, conditions = certificate.mu or 0, validation.settings.conditions
+        return measure_shift(
+            engine, env, rounds, u, options.episodes, lambda _: bar.step(), conditions
+        )
