@@ -1,4 +1,4 @@
-"""Fourteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found,
+"""Fifteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found,
 and nothing else.
 """
 
@@ -201,6 +201,17 @@ def joint(root: Path, rng: Rng) -> str:
     return "observation.state: .*its zero or sign differs"
 
 
+def commands(root: Path, rng: Rng) -> str:
+    """A gripper that does not follow."""
+    follows = float(rng.choice([0.0, 0.4]))
+
+    def change(state: np.ndarray, action: np.ndarray) -> None:
+        state[:, 4] = 0.04 + (state[:, 4] - 0.04) * follows
+
+    move(root, change)
+    return "action: .*but only moves"
+
+
 def wraps(root: Path, rng: Rng) -> str:
     """A joint in degrees or radians that passes the end of its turn."""
     place, half = int(rng.integers(4)), float(rng.choice([180.0, np.pi]))
@@ -218,7 +229,7 @@ def wraps(root: Path, rng: Rng) -> str:
 
 PLANTS: tuple[Plant, ...] = (
     *(counts, rows, names, frames, finite, times, statistics, died, tasks),
-    *(idle, lag, cameras, joint, wraps),
+    *(idle, lag, cameras, joint, commands, wraps),
 )
 
 

@@ -36,7 +36,7 @@ _AGAIN = "correct the recorder, and record again"
 
 
 def check_motions(dataset: Dataset) -> Iterator[Finding]:
-    """Check for idle time, wrapping joints, lagging actions and changed zeros."""
+    """Check for idle time, wrapping joints, lagging actions, changed zeros, unreached commands."""
     names = (s.STATE, s.ACTION)
     features = [dataset.features[key] for key in names if key in dataset.features]
     if [len(feature.shape) for feature in features if feature.dtype in NUMBERS] != [1, 1]:
@@ -62,6 +62,7 @@ def check_motions(dataset: Dataset) -> Iterator[Finding]:
         arm = ~gripper if gripper.any() else np.arange(len(names)) < len(names) - 1
         yield from _check_lag(dataset, rows, told[:, arm], found[:, arm])
         yield from _check_joints(dataset, rows, told[:, arm], found[:, arm], names[arm])
+        yield from _check_commands(told, found, names)
 
 
 def _check_idle(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
@@ -171,6 +172,26 @@ def _find_apart(values: F64, least: float) -> Mask:
     extent = max(np.ptp(ranked[:cut]), np.ptp(ranked[cut:]))
     is_apart = ranked[cut] - ranked[cut - 1] > max(5 * extent, least)
     return (above if 2 * above.sum() <= len(values) else ~above) & is_apart
+
+
+def _check_commands(told: F64, found: F64, names: NDArray[np.str_]) -> Iterator[Finding]:
+    """Find commands that are never reached, mostly of the gripper.
+
+    A joint that moves by a small share of its command but correlates with it has other units: no
+    finding.
+    """
+    low, high = np.quantile(told, [0.01, 0.99], axis=0)
+    below, above = np.quantile(found, [0.01, 0.99], axis=0)
+    extent = high - low
+    share = (above - below) / np.maximum(extent, 1e-9)
+    stuck = (share < 0.05) & (np.abs(_correlate(told, found)) < 0.5)
+    inside = (
+        (share >= 0.05) & (share < 0.5) & (np.minimum(below - low, high - above) > 0.1 * extent)
+    )
+    for joint in np.flatnonzero((extent > 1e-6) & (stuck | inside)):
+        commanded = f"{names[joint]} is commanded {low[joint]:.3g} to {high[joint]:.3g}"
+        text = f"{commanded}, but only moves from {below[joint]:.3g} to {above[joint]:.3g}"
+        yield warning(s.ACTION, text, f"calibrate or free that joint: {_AGAIN}")
 
 
 def check_cameras(dataset: Dataset) -> Iterator[Finding]:
