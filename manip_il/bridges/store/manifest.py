@@ -17,17 +17,19 @@ from typing import Any, Literal, override
 from fsspec.callbacks import Callback
 
 from manip_il import checks
+from manip_il.bridges.doctor.files import journals_of
 from manip_il.bridges.store.errors import RemoteError
 from manip_il.data.lerobot_layout import INFO
 
 MANIFEST_FILE = "manip_il_manifest.json"
+JOURNALS = "journals"  # name of a folder of journals, in a pushed dataset or anywhere in a run
 # the link `last` to the newest checkpoint is not pushed; a pull creates it
 CHECKPOINTS, LAST = "checkpoints", "last"
 # the first once per repository, the second once per policy
 CARD, CONFIG = "README.md", "config.json"
 _POLICIES = ("pretrained_model", "best/pretrained_model")
 _CHECKPOINT = re.compile(rf"{CHECKPOINTS}/\d+/pretrained_model")
-_LEFT_OUT = re.compile(rf"\..*|.*\.(partial|incomplete|tmp)|__pycache__|journals|{MANIFEST_FILE}")
+_LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
 # names of files that hold data; all others could be code, or pickles, which can run code
 _DATA = re.compile(
     r".*\.(json|jsonl|ya?ml|toml|txt|md|csv|tsv|log|html|pdf|png|jpe?g|gif|webp|svg|mp4"
@@ -200,16 +202,24 @@ def check_path(path: object) -> None:
         )
 
 
-def list_files(root: Path) -> dict[str, Path]:
+def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, Path]:
     """Return the files of a dataset or run by their paths in the manifest.
 
-    Hidden and unfinished files and journals are left out. Raises `RemoteError` for a link, unless
-    it is a run's link to its last checkpoint.
+    Hidden and unfinished files are left out.
+
+    Args:
+        root: Folder of the dataset or run.
+        kind: Which of them it is.
+        journals: Whether to include a dataset's `<root>.journals`, as `journals/`, and the journals
+            in a run.
+
+    Raises:
+        RemoteError: for a link, unless it is a run's link to its last checkpoint.
     """
     local: dict[str, Path] = {}
     for path in sorted(root.rglob("*")):
         parts = path.relative_to(root).parts
-        if any(map(_LEFT_OUT.fullmatch, parts)):
+        if any(map(_LEFT_OUT.fullmatch, parts)) or (JOURNALS in parts[:-1] and not journals):
             continue
         if path.is_symlink():
             if parts[-2:] != (CHECKPOINTS, LAST):
@@ -218,6 +228,8 @@ def list_files(root: Path) -> dict[str, Path]:
                 )
         elif path.is_file():
             local["/".join(parts)] = path
+    if journals and kind == "dataset" and (beside := journals_of(root)).is_dir():
+        local |= {f"{JOURNALS}/{name}": path for name, path in list_files(beside, kind).items()}
     return local
 
 
