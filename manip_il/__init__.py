@@ -22,6 +22,8 @@ _HOMES = {  # public name -> module, and the name there if it differs
     "Checkpoint": "learn.checkpoint",
     "Dataset": "data.dataset",
     "Expert": "worlds.ladder.expert:LadderExpert",
+    "GymWorld": "worlds.gym.world",
+    "Label": "mdp",
     "FitConfig": "learn.fit_config",
     "LearnedPolicy": "learn.policy",
     "RunConfig": "algorithms.config",

@@ -7,8 +7,9 @@ from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import train
-from manip_il.mdp import State
+from manip_il.mdp import Label, State
 from manip_il.sim.config import CameraConfig
+from manip_il.worlds.gym.world import GymWorld
 from manip_il.worlds.ladder.expert import LadderExpert as Expert
 from manip_il.worlds.ladder.world import make_env
 from manip_il.worlds.table import make_config
@@ -19,6 +20,8 @@ __all__ = [
     "Dataset",
     "Expert",
     "FitConfig",
+    "GymWorld",
+    "Label",
     "LearnedPolicy",
     "RunConfig",
     "State",

@@ -154,8 +154,9 @@ class RunConfig(Seeded):
         at_least=1,
     )
     disturbed_share: float = option(
-        0.5,
-        "share of a round's rollouts with disturbances: knocked object, noisy actions",
+        None,
+        "share of a round's rollouts with disturbances: knocked object, noisy actions; by default"
+        " half of them, and none if the environment cannot be varied",
         at_least=0,
         at_most=1,
     )
@@ -171,9 +172,12 @@ class RunConfig(Seeded):
     start: Path | None = None
 
     def __post_init__(self) -> None:
+        spec = env_spec(self.env)
+        if self.disturbed_share is None:
+            object.__setattr__(self, "disturbed_share", 0.5 if "varied" in spec.can else 0.0)
         check_bounds(self)
         if self.disturbed_share:
-            env_spec(self.env).require("varied", "give --disturbed_share=0")
+            spec.require("varied", "give --disturbed_share=0")
         if self.redraw and (self.cameras is None or self.label != "per_state"):
             raise UsageError("redraw is for picture policies; give --cameras and --label=per_state")
         if self.method not in ALGORITHMS:

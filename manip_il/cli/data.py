@@ -87,10 +87,16 @@ class Edit(Replacing):
         positional=True,
     )
     robot: NameOrPath | None = option(
-        None, "YAML file of the dataset's robot, if it is your own", flag="robot.type"
+        None,
+        "YAML file of the dataset's robot, or Python file of its world, if it is your own",
+        flag="robot.type",
+        alias="env.type",
     )
     task: NameOrPath | None = option(
-        None, "Python file of the dataset's task, if it is your own", flag="task.type"
+        None,
+        "Python file of the dataset's task, if it is your own",
+        flag="task.type",
+        alias="env.task",
     )
     object: NameOrPath | None = option(
         None,

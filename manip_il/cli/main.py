@@ -80,6 +80,10 @@ COMMANDS = {
     "robot new": ("robots:RobotNewOptions", "write a first YAML file for an arm's MJCF"),
     "robot check": ("robots:RobotCheckOptions", "measure what an arm can do, before recording"),
     "robot certify": ("robots:CertifyOptions", "measure from which states the expert recovers"),
+    "env check": (
+        "robots:EnvCheckOptions:robots",
+        "does a world of your own keep the contract, and how good is its expert",
+    ),
     "rl gail": (
         "chapter:GailOptions:learning",
         "imitate by GAIL: reinforcement learning from demonstrations",
@@ -101,6 +105,7 @@ COMMANDS = {
 GROUPS = {
     "data": "check, repair, edit, score and convert datasets",
     "robot": "add an arm of your own; measure what an arm can do",
+    "env": "check an environment and an expert of your own",
     "rl": "reinforcement learning: GAIL, AIRL, PPO",
     "reward": "learn rewards from demonstrations or preferences",
 }

@@ -80,8 +80,9 @@ class Option:
         type: The type of its value.
         default: Its default; `MISSING` if the user must give a value.
         metadata: `help`, one line; `positional` for a value without a name; `command_line_only` for
-            an option that no file may set; `flag`, the full name; `at_least` and `at_most`; `free`
-            and `grows` for an option that a resumed run may change (see `check_same_options`).
+            an option that no file may set; `flag`, the full name; `alias`, another one;
+            `at_least` and `at_most`; `free` and `grows` for an option that a resumed run may change
+            (see `check_same_options`).
     """
 
     name: str  # dotted: `dataset.root`
@@ -296,7 +297,7 @@ def parse[T](cls: type[T], words: Sequence[str], command: str = "COMMAND") -> T:
     Raises:
         UsageError: for an unknown name, or for an invalid or missing value.
     """
-    known = {option.name: option for option in options_of(cls)}
+    known = _named(options_of(cls))
     known[CONFIG_PATH] = Option(CONFIG_PATH, (), Path, None, {})
     raw = _read_words(words, known, command)
     file = raw.pop(CONFIG_PATH, None)
@@ -323,7 +324,7 @@ def from_layers[T](
     Raises:
         UsageError: for an unknown name, or for an invalid or missing value.
     """
-    known = {option.name: option for option in options_of(cls)}
+    known = _named(options_of(cls))
     raw = dict[str, _Value]()
     for origin, tree in layers:
         raw |= _read_tree(tree, known, origin)
@@ -339,6 +340,12 @@ def from_layers[T](
         if option.default is MISSING:
             raise UsageError(f"{option.label} is missing; expected {metavar(option.type)}")
     return _build(cls, changes)
+
+
+def _named(options: Sequence[Option]) -> dict[str, Option]:
+    """Return options by their names, and by their aliases."""
+    aliases = {one.metadata["alias"]: one for one in options if "alias" in one.metadata}
+    return aliases | {one.name: one for one in options}
 
 
 def dump_yaml(options: Any) -> str:

@@ -134,3 +134,21 @@ class CertifyOptions(Seeded, EngineOptions, Output):
         500, "episodes for each kind of perturbation", at_least=1, at_most=1_000_000
     )
     output_dir: Path = output_folder("runs/certificate")
+
+
+@dataclass(frozen=True)
+class EnvCheckOptions:
+    """Check that an environment and its expert keep the contract that everything else relies on.
+
+    The same seed gives the same start; a restored state goes on the same; the expert is a function
+    of the state, or says that it is not. Prints its success, and the time of a step and a label.
+    The exit code is 1 if a part is not kept.
+
+    Example: manip-il env check lift.py --episodes=50
+    """
+
+    world: NameOrPath = option(
+        MISSING, "the world's Python file (docs/new-env.md), or a name", positional=True
+    )
+    task: NameOrPath = option(EnvConfig.task, "its task, if it has several", flag="env.task")
+    episodes: int = option(50, "episodes of the expert", at_least=0, at_most=1_000_000)

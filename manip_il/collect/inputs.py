@@ -14,7 +14,14 @@ from manip_il.data.schema import check_same_spec
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.table import complete, env_fingerprint, env_spec, stored_config, world_of
+from manip_il.worlds.table import (
+    FIELDS,
+    complete,
+    env_fingerprint,
+    env_spec,
+    stored_config,
+    world_of,
+)
 
 _LOG = logging.getLogger(__name__)
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
@@ -28,7 +35,7 @@ def env_config(given: Mapping[str, Any], origin: Origin | None = None) -> EnvCon
     """
     values = {name: value for name, value in given.items() if value is not None}
     if origin is not None:
-        lacking = [one for one in own_files(origin) if one[2:].partition(".")[0] not in values]
+        lacking = [one for one in own_files(origin) if FIELDS[one.partition("=")[0]] not in values]
         if lacking:
             raise UsageError(
                 f"the policy is for {origin.robot} {origin.task}, of a file of your own; give"
@@ -51,14 +58,14 @@ def own_files(spec: Any, shape: str = "") -> list[str]:
     """
     if spec.task == UNKNOWN_TASK:
         return []
-    return world_of(spec.robot).own_files(spec.robot, spec.task, shape)
+    return world_of(spec.robot).own_files(spec, shape)
 
 
 def path_options(env: Mapping[str, Any]) -> list[str]:
     """Return the options of an environment that name files of the user's own, which nothing that
     is written stores.
     """
-    flags = {"robot": "--robot.type", "task": "--task.type", "object": "--task.object"}
+    flags = {field: flag for flag, field in FIELDS.items()}
     return [f"{flags[key]}={env[key]}" for key in flags if isinstance(env.get(key), Path)]
 
 
@@ -80,7 +87,7 @@ def differences(dataset: Dataset) -> list[str]:
     is not compared, because it holds only the name of that arm or task.
     """
     spec, name = dataset.spec, str(dataset.root)
-    if world_of(spec.robot).own_files(spec.robot, spec.task, spec.object):
+    if world_of(spec.robot).own_files(spec, spec.object):
         return []
     env = stored_config(spec)
     check_same_spec(name, spec, "this program", env_spec(env))

@@ -151,7 +151,8 @@ def run_steps(
     """
     policies = tuple(_load(job, checkpoint) for checkpoint in job.driver.policies)
     setting = Setting(envs[0].actions, job.env.horizon, policies)
-    rules = Rules(job.env.horizon, job.hold, job.patience, takeover=job.label == "takeover")
+    patience = job.patience if env_spec(job.env).has_progress else None
+    rules = Rules(job.env.horizon, job.hold, patience, takeover=job.label == "takeover")
     gate = gate_of(job.label, job.query, setting)
     return rollout(envs, seeds, act or job.driver.start(setting), rules, make_expert(job.env), gate)
 

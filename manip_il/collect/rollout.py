@@ -203,6 +203,6 @@ def _advance(slot: _Slot, rules: Rules) -> Transition:
         actor=actor,
         reward=outcome.reward,
         success=outcome.solved,
-        done=slot.step >= horizon or has_ended or gives_up,
+        done=slot.step >= horizon or outcome.ended or has_ended or gives_up,
         progress=slot.turn.progress,
     )

@@ -157,6 +157,8 @@ class Dataset:
             raise ManipError(
                 f"{self.root} has no column {s.ACTION}, so there is nothing to learn from it"
             )
+        moved = features[s.ACTION]
+        mine = features.get(s.STATE)
         around = features.get(s.ENVIRONMENT_STATE)
         cameras = [
             features[key]
@@ -174,7 +176,8 @@ class Dataset:
             **robot,
             task=UNKNOWN_TASK,
             fps=self.fps,
-            joint_names=features[s.ACTION].labels,
+            joint_names=moved.labels,
+            state_names=mine.labels if mine and mine.labels != moved.labels else (),
             environment_state_names=around.labels if around else (),
             sim_state_size=features[s.SIM_STATE].size if s.SIM_STATE in features else 0,
             instruction=self.instruction,

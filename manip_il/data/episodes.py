@@ -73,7 +73,6 @@ def _row(frame: Transition, *, labelled: bool) -> dict[str, Any]:
     seen, label = frame.observation, frame.label
     row: dict[str, Any] = {
         schema.STATE: seen.state,
-        schema.ENVIRONMENT_STATE: seen.environment_state,
         schema.EXECUTED_ACTION: frame.executed_action,
         schema.ACTOR: int(frame.actor),
         schema.SIM_STATE: frame.state.to_vector(),
@@ -84,6 +83,8 @@ def _row(frame: Transition, *, labelled: bool) -> dict[str, Any]:
         schema.SEED: frame.seed,
         schema.EXPERT_PHASE: label.phase if label else 0,
     }
+    if seen.environment_state.size:
+        row[schema.ENVIRONMENT_STATE] = seen.environment_state
     row |= {schema.IMAGES + camera: picture for camera, picture in seen.images.items()}
     row |= {schema.KEYPOINTS + camera: points for camera, points in seen.keypoints.items()}
     if labelled:

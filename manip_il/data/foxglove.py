@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from manip_il.data import schema as s
 from manip_il.mdp import Episode
+from manip_il.worlds.contract import EnvironmentSpec
 
 U8 = NDArray[np.uint8]
 Encode = Callable[[Any, Timestamp], Message | str]  # a frame's value and time -> message, or JSON
@@ -105,11 +106,14 @@ def texts(name: str) -> Encode:
     return lambda line, time: Log(timestamp=time, level=Log.Level.INFO, name=name, message=line)
 
 
-def episode_channels(episode: Episode, joints: Sequence[str]) -> dict[str, Channel]:
-    """Return an episode's columns by topic. joints: names of the joints."""
+def episode_channels(episode: Episode, spec: EnvironmentSpec) -> dict[str, Channel]:
+    """Return an episode's columns by topic. spec: names the numbers of states and actions."""
     columns = episode.columns
     found: dict[str, Channel] = {
-        topic: (joint_states(joints), columns[key].tolist())
+        topic: (
+            joint_states(spec.observed_names if key == s.STATE else spec.joint_names),
+            columns[key].tolist(),
+        )
         for topic, key in _JOINT_TOPICS.items()
         if key in columns
     }

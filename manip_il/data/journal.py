@@ -51,7 +51,7 @@ class Journal:
         writer.start(profile="", library=_RECORD)
         writer.add_metadata(_RECORD, _to_texts(self, episode))
         times = foxglove.frame_times(len(episode), exact_rate(self.spec.fps))
-        channels = foxglove.episode_channels(episode, self.spec.joint_names)
+        channels = foxglove.episode_channels(episode, self.spec)
         foxglove.add_channels(writer, channels, times)
         for key, column in episode.columns.items():
             if not key.startswith(IMAGES):  # pictures are stored as lossless messages

@@ -30,7 +30,15 @@ BETA = "beta"
 OWN_OBJECT = "the task's own"  # meaning of an empty object name
 LEROBOT_TYPES = {"so_follower": "so101"}  # LeRobot's `robot_type` -> our name, if it differs
 MOST_FPS = 10_000  # highest control rate [Hz]
-MUST_AGREE = ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning")
+MUST_AGREE = (
+    "robot",
+    "fps",
+    "joint_names",
+    "state_names",
+    "object",
+    "environment_state_names",
+    "action_meaning",
+)
 _SCALARS = {  # column -> dtype
     **{PROGRESS: "float32", REWARD: "float32", SUCCESS: "bool", DONE: "bool"},
     **{SEED: "int64", ROUND: "int64", BETA: "float32"},
@@ -59,6 +67,7 @@ def robot_of(robot_type: str) -> dict[str, str]:
 def features(spec: EnvironmentSpec) -> dict[str, dict[str, Any]]:
     """Return LeRobot's feature table for our columns (LeRobot adds its own index columns)."""
     joints, pictured = list(spec.joint_names), "video" if spec.video else "image"
+    around = spec.environment_state_names
     points = [f"{name}.{what}" for name in spec.keypoints for what in ("across", "down", "in_view")]
     pictures = {
         "dtype": pictured,
@@ -66,8 +75,8 @@ def features(spec: EnvironmentSpec) -> dict[str, dict[str, Any]]:
         "names": ["height", "width", "channels"],
     }
     return {
-        STATE: _feature("float32", joints),
-        ENVIRONMENT_STATE: _feature("float32", spec.environment_state_names),
+        STATE: _feature("float32", spec.observed_names),
+        **({ENVIRONMENT_STATE: _feature("float32", around)} if around else {}),
         **{key: dict(pictures) for key in spec.image_keys},
         **{key: _feature("float32", points) for key in spec.keypoint_keys},
         ACTION: _feature("float32", joints),

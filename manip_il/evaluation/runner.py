@@ -135,8 +135,11 @@ def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
     name -> [x, y, z].
 
     The hand is named `hand`. The first object that the arm must reach is named `object`.
+    Empty if the environment cannot be restored.
     """
     world = described_env(env)
+    if "restored" not in world.spec.can:
+        return {}
     world.set_state(State.from_vector(sim_state))
     return {
         name: [round(float(value), 4) for value in at] for name, at in world.positions().items()

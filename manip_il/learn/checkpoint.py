@@ -92,13 +92,15 @@ class Origin:
     look: dict[str, Any] | None = None
     datasets: list[dict[str, Any]] = field(default_factory=list)
     action_space: str | None = None
-    object: str = ""  # see `EnvironmentSpec`
+    object: str = ""  # see `EnvironmentSpec`, also for the next one
+    state_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
         checks.task_name(self.task)
         checks.object_name(self.object)
-        for name in ("joint_names", "environment_state_names", "cameras", "image_size"):
+        names = ("joint_names", "state_names", "environment_state_names")
+        for name in (*names, "cameras", "image_size"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
 
     @classmethod
@@ -125,7 +127,10 @@ class Origin:
 
     def write(self, folder: Path) -> None:
         """Write `manip_il.json` into a `pretrained_model` folder."""
-        values = {name: value for name, value in asdict(self).items() if value or name != "object"}
+        optional = ("object", "state_names")
+        values = {
+            name: value for name, value in asdict(self).items() if value or name not in optional
+        }
         (folder / META_FILE).write_text(json.dumps(values, indent=2) + "\n")
 
     def check_fits(self, spec: EnvironmentSpec) -> None:
@@ -275,7 +280,7 @@ class Checkpoint:
         environment, joints = f"{spec.robot}/{spec.task}", len(spec.joint_names)
         has: dict[str, Any] = {
             _IK_ROBOT: spec.robot,
-            STATE: joints,
+            STATE: len(spec.observed_names),
             ACTION: joints,
             ENVIRONMENT_STATE: len(spec.environment_state_names),
             **dict.fromkeys(spec.image_keys, spec.image_size),

@@ -187,7 +187,7 @@ class CNNPolicy(MLPPolicy):
             # the cnn scales the offsets itself
             width, scaled = self.seen_size + size, {"scales": ()}
             width += len(config.scales) * len(self.offsets)
-        self.model = MLPNetwork(width, n, NetworkConfig.of(vars(config) | scaled))
+        self.model = MLPNetwork(width, self._numbers_out(), NetworkConfig.of(vars(config) | scaled))
 
     @override
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:

@@ -22,7 +22,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, UsageError
-from manip_il.learn.names import EE_DELTA
+from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork, NetworkConfig
 from manip_il.learn.samples import Table, label_valid
 
@@ -82,12 +82,15 @@ class MLPConfig(NetworkConfig, PreTrainedConfig):
 
     @override
     def validate_features(self) -> None:
-        """Raise unless `observation.state` and `action` exist and have the same size."""
+        """Raise unless `observation.state` and `action` exist, of the same size if targets are
+        relative.
+        """
         state, action = self.robot_state_feature, self.action_feature
-        if not state or not action or len(state.shape) != 1 or state.shape != action.shape:
+        is_relative = self.action_space == JOINT_DELTA
+        if not state or not action or (is_relative and state.shape != action.shape):
             raise UsageError(
-                f"the {self.type} policy needs observation.state and action of the same size; they"
-                f" are {state} and {action}"
+                f"the {self.type} policy needs observation.state and action, of the same size in"
+                f" the action space {JOINT_DELTA}; they are {state} and {action}"
             )
 
     @override
@@ -160,7 +163,11 @@ class MLPPolicy(PreTrainedPolicy):
         features = config.input_features or {}
         config.input_features = {key: features[key] for key in self.inputs}
         width = sum(features[key].shape[0] for key in self.inputs)
-        self.model = MLPNetwork(width, features[STATE].shape[0], config)
+        self.model = MLPNetwork(width, self._numbers_out(), config)
+
+    def _numbers_out(self) -> int:
+        """Return the number of values in an action."""
+        return (self.config.output_features or {})[ACTION].shape[0]
 
     def _offsets(self, places: tuple[int, ...]) -> tuple[int, ...]:
         """Return the indices among the inputs of these numbers of the environment state."""

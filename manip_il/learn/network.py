@@ -197,6 +197,7 @@ class MLPNetwork(nn.Module):
         self.n = n
         self.clamp = config.clamp
         self.loss = config.loss
+        self.adds = config.action_space == JOINT_DELTA
         added = torch.full((n,), float(config.action_space == JOINT_DELTA))
         added[list(config.grippers)] = 0.0
         self.register_buffer("added", added, persistent=False)
@@ -262,7 +263,7 @@ class MLPNetwork(nn.Module):
         """Return absolute actions (B, n) minus the measured joints that the network adds to its
         output.
         """
-        return actions - self.added * inputs[:, : self.n]
+        return actions - self._measured(inputs)
 
     @torch.no_grad()
     def act(self, inputs: Tensor) -> Tensor:
@@ -282,7 +283,11 @@ class MLPNetwork(nn.Module):
         target = torch.clamp(
             y * self.target_scale + self.target_mean, self.target_low, self.target_high
         )
-        return target + self.added * inputs[:, : self.n]
+        return target + self._measured(inputs)
+
+    def _measured(self, inputs: Tensor) -> Tensor | float:
+        """Return the measured joints that are added to the targets, (B, n); 0 if there are none."""
+        return self.added * inputs[:, : self.n] if self.adds else 0.0
 
 
 @contextmanager

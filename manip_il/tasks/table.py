@@ -7,17 +7,15 @@ names its task: what these store is a `str`, which is a name.
 
 import hashlib
 import inspect
-import sys
 from collections.abc import Callable
 from functools import cache
-from importlib.machinery import SourceFileLoader
 from importlib.metadata import entry_points
 from pathlib import Path
-from types import ModuleType
 
 from manip_il import checks
-from manip_il.errors import OWN, UnknownName, UsageError
+from manip_il.errors import UnknownName, UsageError
 from manip_il.option import NameOrPath
+from manip_il.own_file import own_class
 from manip_il.sim.shape import ObjectShape
 from manip_il.sim.task import Task
 from manip_il.tasks.carry.task import Carry
@@ -105,31 +103,8 @@ def _named(name: str) -> Task:
 @cache
 def _of_file(path: Path) -> Task:
     """Run a file; return its one task."""
-    if not path.is_file():
-        raise UsageError(f"{path} does not exist; expected a Python file with a task of your own")
-    name = f"{OWN}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
-    module = sys.modules[name] = ModuleType(name)  # dataclasses look it up there
-    module.__file__ = str(path)
-    try:
-        SourceFileLoader(name, str(path)).exec_module(module)
-    except Exception as error:
-        del sys.modules[name]
-        raise UsageError(
-            f"{path} cannot be run: {type(error).__name__}: {checks.one_line(error)}"
-        ) from error
-    tasks = [
-        value
-        for key, value in vars(module).items()
-        if inspect.isclass(value) and issubclass(value, Task) and value.__module__ == name
-        if not key.startswith("_")
-    ]
-    if len(tasks) != 1:
-        found = ", ".join(cls.__name__ for cls in tasks) or "none"
-        raise UsageError(
-            f"tasks in {path}: {found}; expected one subclass of manip_il.task.Task"
-            " (docs/new-task.md)"
-        )
-    task = _made(f"{path}: task {tasks[0].__name__}", tasks[0])
+    cls = own_class(path, Task, "manip_il.task.Task (docs/new-task.md)")
+    task = _made(f"{path}: task {cls.__name__}", cls)
     if task.name in TASKS:
         raise UsageError(
             f"{path}: its task has a built-in task's name, {task.name!r}; choose another"

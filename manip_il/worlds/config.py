@@ -16,10 +16,12 @@ class Listed(NamedTuple):
 
     module: str
     about: str
-    tasks: tuple[str, ...]
+    tasks: tuple[str, ...]  # some of them, if there are `others`
     cameras: tuple[str, ...] = ()
+    others: int = 0
 
 
+WORLD_GROUP = "manip_il.worlds"  # entry points: a world's name, and its `GymWorld`
 WORLDS: dict[NameOrPath, Listed] = {
     "fetch_stock": Listed(
         "manip_il.worlds.fetch.expert",
@@ -32,14 +34,29 @@ WORLDS: dict[NameOrPath, Listed] = {
         ("AlohaTransferCube-v0", "AlohaInsertion-v0"),
         ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist"),
     ),
+    "metaworld": Listed(
+        "manip_il.worlds.metaworld",
+        "Meta-World's Sawyer",
+        ("push-v3", "peg-insert-side-v3"),
+        ("corner2",),
+        others=48,
+    ),
 }
+
+
+def _listed(world: Listed) -> str:
+    others = (f"{world.others} others",) if world.others else ()
+    return ", ".join(world.tasks + others)
+
+
 ROBOT_HELP = (
-    f"{', '.join(ROBOTS)}, the path of your own arm's YAML, or, unmodified, "
+    f"{', '.join(ROBOTS)}, the path of your own arm's YAML or your own world's Python file, or,"
+    " unmodified, "
     f"{', '.join(f'{name} ({world.about})' for name, world in WORLDS.items())}"
 )
 TASK_HELP = (
     f"{', '.join((*NAMES, *SEVERAL))}, or the path of your own task's Python file; "
-    f"{'; '.join(f'with {name}, ' + ', '.join(world.tasks) for name, world in WORLDS.items())}"
+    f"{'; '.join(f'with {name}, ' + _listed(world) for name, world in WORLDS.items())}"
 )
 
 
@@ -56,8 +73,8 @@ class EnvConfig(Episodes):
             a mesh; empty for the task's default.
     """
 
-    robot: NameOrPath = option("panda", ROBOT_HELP, flag="robot.type")
-    task: NameOrPath = option("pick_place", TASK_HELP, flag="task.type")
+    robot: NameOrPath = option("panda", ROBOT_HELP, flag="robot.type", alias="env.type")
+    task: NameOrPath = option("pick_place", TASK_HELP, flag="task.type", alias="env.task")
     object: NameOrPath = option("", f"{SHAPE_HELP}; by default the task's own", flag="task.object")
 
     @property

@@ -27,6 +27,7 @@ from manip_il.worlds.fingerprint import canonical_json
 OPENINGS = "joint position targets [rad], gripper opening command [m]"
 # as in LeRobot's recorder
 SERVOS = "joint position targets [deg], gripper position command [0 to 100]"
+OWN_ACTIONS = "action of the environment"
 TWO_ARMS = "joint position targets [rad], gripper command [0 to 1], of two arms"
 JOINT_TARGETS = (OPENINGS, SERVOS, TWO_ARMS)
 # action meaning -> indices of the grippers in state and action; by default the last
@@ -34,7 +35,7 @@ GRIPPERS = {TWO_ARMS: (6, 13)}
 # version of the columns and their meaning: 2 has progress, complete states and named phases
 VERSION = 2
 # keys of a spec's JSON that may be missing
-_OPTIONAL = ("object", "robot_type", "video", "keypoints")
+_OPTIONAL = ("object", "robot_type", "video", "keypoints", "state_names", "expert")
 
 Ability = Literal["restored", "varied", "redrawn", "perturbed", "drawn", "shown in a window"]
 """What can be done with an environment.
@@ -77,6 +78,10 @@ class EnvironmentSpec:
     video: bool = True
     # points of the scene whose image coordinates are columns, for every camera
     keypoints: tuple[str, ...] = ()
+    # names of the numbers of `observation.state`; empty if they are those of the action
+    state_names: tuple[str, ...] = ()
+    # whether the expert is a function of the state, or keeps memory within an episode
+    expert: Literal["stateless", "recurrent"] = "stateless"
     schema: int = VERSION
 
     # Of an environment alone: neither stored in datasets and checkpoints, nor compared
@@ -90,6 +95,7 @@ class EnvironmentSpec:
     ends_solved: bool | None = _not_stored(None)
     # whether environments in one process share one compiled model
     shares_model: bool = _not_stored(True)
+    has_progress: bool = _not_stored(True)  # whether `progress` says more than `solved`
 
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
@@ -108,6 +114,8 @@ class EnvironmentSpec:
         values |= {
             "video": None if self.video else False,
             "keypoints": list(self.keypoints) or None,
+            "state_names": list(self.state_names) or None,
+            "expert": None if self.expert == "stateless" else self.expert,
         }
         return {
             key: value
@@ -130,6 +138,11 @@ class EnvironmentSpec:
             key: tuple(one) if isinstance(one, list) else one for key, one in data.items()
         }
         return cls(**values)
+
+    @property
+    def observed_names(self) -> tuple[str, ...]:
+        """Names of the numbers of `observation.state`."""
+        return self.state_names or self.joint_names
 
     @property
     def image_keys(self) -> dict[str, str]:
@@ -170,8 +183,8 @@ class Unable(UsageError):
 
 
 class Outcome(NamedTuple):
-    """What one control step did: the action as executed, before clipping (n,), its reward, and
-    success after it.
+    """What one control step did: the action as executed, before clipping (n,), its reward, success
+    after it, and whether the environment has ended the episode.
 
     `executed` is the given array itself unless the environment changed it.
     """
@@ -179,6 +192,7 @@ class Outcome(NamedTuple):
     executed: NDArray[Any]
     reward: float
     solved: bool
+    ended: bool = False
 
 
 class Environment(Protocol):
@@ -292,12 +306,11 @@ class WorldKind:
         """Return a number that changes when pictures do."""
         raise NotImplementedError
 
-    def own_files(self, robot: str, task: str, shape: str) -> list[str]:
+    def own_files(self, spec: Any, shape: str) -> list[str]:
         """Return the options that commands need for what is not built in.
 
         Args:
-            robot: Name of the robot.
-            task: Name of the task.
+            spec: The `EnvironmentSpec` of a dataset or the `Origin` of a policy.
             shape: The object, as a dataset stores it; empty for the task's default.
 
         Returns:

@@ -193,18 +193,8 @@ class Packaged(WorldKind):
         return DRAWN
 
     @override
-    def own_files(self, robot: str, task: str, shape: str) -> list[str]:
-        """Return the option that names a task if the package has none of this name.
-
-        Args:
-            robot: Not used.
-            task: Name of the task.
-            shape: Not used.
-
-        Returns:
-            One option, with the names of all tasks; [] if the package has the task.
-        """
-        return [] if task in self._tasks else [f"--task.type={'|'.join(self._tasks)}"]
+    def own_files(self, spec: Any, shape: str) -> list[str]:
+        return [] if spec.task in self._tasks else [f"--task.type={'|'.join(self._tasks)}"]
 
     @override
     def fingerprint(self, config: EnvConfig) -> dict[str, str]:

@@ -9,26 +9,40 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manip_il.caching import cached_per_thread
 from manip_il.errors import UsageError
 from manip_il.option import NameOrPath, check_bounds, make_options, typed
 from manip_il.sim.config import CameraConfig
-from manip_il.worlds.config import WORLDS, EnvConfig
+from manip_il.worlds.config import WORLD_GROUP, WORLDS, EnvConfig
 
 if TYPE_CHECKING:
     from manip_il.sim.conditions import Condition
     from manip_il.worlds.contract import Environment, EnvironmentSpec, Expert, WorldKind
 
+# options that name files of the user's own -> fields of `EnvConfig`
+FIELDS = {
+    "--env.type": "robot",
+    "--robot.type": "robot",
+    "--env.task": "task",
+    "--task.type": "task",
+    "--task.object": "object",
+}
 _KEPT = 4  # environments and experts kept for each thread: the finest scenes take 64 MB
 
 
 _OURS = "manip_il.worlds.ladder.world"  # of every other robot
 
 
+@cache
 def world_of(robot: NameOrPath) -> WorldKind:
-    """Return the world of a robot."""
+    """Return the world of a robot, of a `Path` of a world of one's own, or of an entry point."""
+    is_file = isinstance(robot, Path) and robot.suffix == ".py"
+    if is_file or entry_points(group=WORLD_GROUP, name=str(robot)):
+        return import_module("manip_il.worlds.gym.environment").own_kind(robot)
     return import_module(WORLDS[robot].module if robot in WORLDS else _OURS).WORLD
 
 
@@ -89,6 +103,12 @@ def stored_config(
         UsageError: if something that is not built in was not given, and whatever else `make_config`
             raises.
     """
+    given = {"robot": robot, "task": task, "object": shape}
+    needed = world_of(spec.robot).own_files(spec, spec.object)
+    if lacking := [one for one in needed if not given[FIELDS[one.partition("=")[0]]]]:
+        raise UsageError(
+            f"{spec.robot} {spec.task} was made with a file of your own; give {' '.join(lacking)}"
+        )
     named = {
         "robot": robot or spec.robot,
         "task": task or spec.task,

@@ -40,6 +40,7 @@ from manip_il.tasks.table import TASKS, get_task, is_task, source_hash
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.contract import (
     OPENINGS,
+    OWN_ACTIONS,
     SERVOS,
     Environment,
     EnvironmentSpec,
@@ -357,20 +358,12 @@ class LadderKind(WorldKind):
         return DRAWN + (str(config.task).partition(":")[0] in _TURNED)
 
     @override
-    def own_files(self, robot: str, task: str, shape: str) -> list[str]:
-        """Return the options for a robot, a task and a mesh of the user's own.
-
-        Args:
-            robot: Name of the robot.
-            task: Name of the task.
-            shape: The object, as a dataset stores it; empty for the task's default.
-
-        Returns:
-            Options with FILE for a path; [] if everything is built in.
-        """
-        robots = [] if is_robot(robot) else ["--robot.type=FILE.yaml"]
+    def own_files(self, spec: Any, shape: str) -> list[str]:
+        if spec.action_meaning == OWN_ACTIONS:
+            return ["--env.type=FILE.py"]
+        robots = [] if is_robot(spec.robot) else ["--robot.type=FILE.yaml"]
         meshes = ["--task.object=mesh:FILE:LENGTH"] if shape.startswith(MESH) else []
-        return [*robots, *([] if is_task(task) else ["--task.type=FILE.py"]), *meshes]
+        return [*robots, *([] if is_task(spec.task) else ["--task.type=FILE.py"]), *meshes]
 
     @override
     def lerobot_words(self, robot: str, task: str) -> list[str]:

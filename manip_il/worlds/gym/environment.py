@@ -1,0 +1,410 @@
+"""A world of one's own behind the contract: its environment, its expert, and how both are made."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import re
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import entry_points, packages_distributions, version
+from pathlib import Path
+from typing import Any, override
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il import checks
+from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.mdp import F64, Label, Observation, State
+from manip_il.own_file import own_class
+from manip_il.robots.action_space import ActionSpace
+from manip_il.robots.spec import model_bytes
+from manip_il.sim.conditions import Condition
+from manip_il.sim.config import CameraConfig
+from manip_il.worlds.config import WORLD_GROUP, EnvConfig
+from manip_il.worlds.contract import (
+    OWN_ACTIONS,
+    Ability,
+    Environment,
+    EnvironmentSpec,
+    Expert,
+    Outcome,
+    Unable,
+    WorldKind,
+)
+from manip_il.worlds.fingerprint import environment_fingerprint
+from manip_il.worlds.gym.drawing import VERSION as DRAWN
+from manip_il.worlds.gym.drawing import camera_names, draw
+from manip_il.worlds.gym.restoring import Simulated, flat, simulation, unflat
+from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
+
+SEEDS = 4  # episodes that are begun to see what is part of a state
+_MOST_SEED = 2**32  # older environments take none that is larger
+_TOLERANCE = 0.05  # [m]; not used, as such a world says by itself what is solved
+
+
+@dataclass(frozen=True, eq=False)
+class GymActions(ActionSpace):
+    """Actions of any meaning, within bounds of which some may be infinite."""
+
+    @override
+    def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
+        """Draw any action within the bounds, (n,), whatever the state is; without bounds, -1 to
+        1.
+        """
+        low, high = np.nan_to_num(self.low, neginf=-1), np.nan_to_num(self.high, posinf=1)
+        return rng.uniform(low, high)
+
+
+class GymEnv(Environment):
+    """One environment of a world.
+
+    Args:
+        world: The world; one instance for each environment.
+        cameras: Cameras rendered in every step; None for none.
+        horizon: Most control steps of an episode; 0 for the world's own.
+
+    Raises:
+        UsageError: if the actions are not a flat `Box`, or `observe` gives something else than it
+            should.
+    """
+
+    def __init__(self, world: GymWorld, cameras: CameraConfig | None = None, horizon: int = 0):
+        self.world, self._cameras = world, cameras
+        self.env = world.make()
+        self.actions = _actions(world, self.env.action_space)
+        simulated = simulation(self.env)
+        self._simulated, self._fresh = None, np.empty(0)
+        self._is_own = _overrides(world, "restore")
+        self.start(0)
+        if simulated and not self._is_own:
+            self._simulated = self._found_state(*simulated)
+            self._fresh = self._simulated.get()
+            self.start(0)
+        self._numbers = flat(self._seen)
+        self._spec = self._described(horizon)
+        self._spec = replace(self._spec, sim_state_size=len(self.get_state().to_vector()))
+
+    @property
+    @override
+    def spec(self) -> EnvironmentSpec:
+        return self._spec
+
+    @property
+    @override
+    def progress(self) -> float:
+        if not self._spec.has_progress:
+            return float(self._solved)
+        return float(self.world.progress(self.env, self._info))
+
+    @override
+    def start(self, seed: int) -> None:
+        if self._simulated:  # nothing is left of an earlier episode
+            self._simulated.set(self._fresh)
+        self._seen, self._info = self.world.reset(self.env, seed % _MOST_SEED)
+        self._count(0, 0, False)
+        self._solved, self._label = False, None
+
+    @override
+    def observe(self) -> Observation:
+        found = self._numbers_seen()
+        pictures = {}
+        if self._cameras is not None:
+            pictures = {
+                name: draw(self.world, self.env, name, self._cameras)
+                for name in self._cameras.names
+            }
+        return Observation(*found, pictures, self.world.text(self.env))
+
+    @override
+    def step(self, action: NDArray[Any]) -> Outcome:
+        given = self.actions.clip(action, self._step)
+        if self.world.recurrent:
+            self.label()
+        self._seen, reward, terminated, truncated, self._info = self.env.step(
+            given.astype(self.env.action_space.dtype)
+        )
+        self._solved, self._label = bool(self.world.solved(self.env, self._info)), None
+        self._count(
+            self._step + 1, self._streak + 1 if self._solved else 0, self._ever or self._solved
+        )
+        return Outcome(action, float(reward), self._solved, bool(terminated or truncated))
+
+    def label(self) -> Label:
+        """Return the expert's label of the present state; the expert is asked once a step."""
+        if self._label is None:
+            self._label = self._checked(self.world.act(self.env, deepcopy(self._seen)))
+        return self._label
+
+    @override
+    def get_state(self) -> State:
+        counts = (self._step, self._streak, self._ever)
+        if "restored" not in self._spec.can:
+            return State(np.empty(0), np.empty(0), *counts)
+        inner = self._simulated.get() if self._simulated else self.world.state(self.env)
+        seen = flat(self._seen)
+        if seen is None:
+            raise ManipError(f"{self._spec.robot}: its observation has numbers that are not finite")
+        return State(np.asarray(inner, np.float64), seen, *counts)
+
+    @override
+    def set_state(self, state: State) -> None:
+        self._spec.require("restored", "give its class `state` and `restore`")
+        if self._simulated:
+            self._simulated.set(state.physics)
+        else:
+            self.world.restore(self.env, state.physics)
+        self._seen, self._info = unflat(state.variation, self._seen), {}
+        self._count(state.step, state.streak, state.ever)
+        self._solved, self._label = state.streak > 0, None
+
+    @override
+    def positions(self) -> dict[str, F64]:
+        return {name: np.asarray(at) for name, at in self.world.positions(self.env).items()}
+
+    def _count(self, step: int, streak: int, ever: bool) -> None:
+        self._step = step
+        self._streak = streak
+        self._ever = ever
+
+    def _numbers_seen(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return `agent_pos` and `environment_state` as the world gives them."""
+        found = self.world.observe(self.env, self._seen)
+        if not isinstance(found, Mapping) or not found.keys() & {AGENT, AROUND}:
+            raise UsageError(
+                f"observe of {_name(self.world)} returned {checks.shorten(found)}; expected a"
+                f" mapping with {AGENT}, {AROUND} or both"
+            )
+        mine, around = (
+            np.ravel(np.asarray(found.get(key, ()), np.float32)) for key in (AGENT, AROUND)
+        )
+        return mine, around
+
+    def _checked(self, given: Any) -> Label:
+        if isinstance(given, Label):
+            action, label = given.action, given
+        else:
+            action = np.asarray(given, np.float64)
+            label = Label(np.ravel(action), 1, True, 0.0)
+        if np.shape(action) != self.actions.low.shape:
+            raise UsageError(
+                f"act of {_name(self.world)} returned an action of shape {np.shape(action)};"
+                f" expected {self.actions.low.shape}"
+            )
+        return replace(label, action=np.clip(label.action, self.actions.low, self.actions.high))
+
+    def _found_state(self, model: Any, data: Any) -> Simulated:
+        """Return what restores the environment, as seen in the first steps of some episodes."""
+        found = Simulated(self.env, model, data)
+        middle = np.clip(0.0, self.actions.low, self.actions.high)
+        for seed in range(SEEDS):
+            self.start(seed)
+            found.look()
+            self.env.step(middle.astype(self.env.action_space.dtype))
+            found.look()
+        return found
+
+    def _described(self, horizon: int) -> EnvironmentSpec:
+        world, env = self.world, self.env
+        mine, around = self._numbers_seen()
+        cameras = world.cameras
+        if cameras is None:
+            cameras = camera_names(env)
+        restores = (self._simulated or self._is_own) and self._numbers is not None
+        can = list[Ability](["drawn"] if cameras else [])
+        if restores and not world.recurrent:
+            can.insert(0, "restored")
+        settings = settings_of(world, env)
+        return EnvironmentSpec(
+            robot=_name(world),
+            task=world.task or _name(world),
+            fps=settings["fps"],
+            joint_names=self.actions.names,
+            state_names=_names(world, AGENT, len(mine)),
+            environment_state_names=_names(world, AROUND, len(around)),
+            sim_state_size=0,
+            instruction=world.instruction or (world.task or _name(world)).replace("-", " "),
+            action_meaning=OWN_ACTIONS,
+            phases=world.phases,
+            expert="recurrent" if world.recurrent else "stateless",
+            horizon=horizon or settings["horizon"],
+            can=tuple(can),
+            all_cameras=cameras,
+            default_cameras=cameras[:1],
+            ends_solved=True,
+            shares_model=False,
+            has_progress=_overrides(world, "progress"),
+        )
+
+
+class GymExpert(Expert):
+    """The expert of a world: its `act`.
+
+    Args:
+        cls: The world.
+        task: Its task.
+    """
+
+    def __init__(self, cls: type[GymWorld], task: str):
+        self._world, self._env = lambda: cls(task), None
+
+    @override
+    def label(self, state: State, environment: Environment | None = None) -> Label:
+        if isinstance(environment, GymEnv):
+            return environment.label()
+        if self._env is None:
+            self._env = GymEnv(self._world())
+        if self._env.world.recurrent:
+            raise Unable(
+                f"the expert of {self._env.spec.robot} keeps memory, so it labels the states of a"
+                " running episode alone; record again what you need"
+            )
+        self._env.set_state(state)
+        return self._env.label()
+
+
+class GymKind(WorldKind):
+    """The environments and experts of one class.
+
+    Args:
+        cls: The class.
+    """
+
+    def __init__(self, cls: type[GymWorld]):
+        self._cls = cls
+
+    @override
+    def complete(self, config: EnvConfig) -> EnvConfig:
+        task = self._task(config)
+        if isinstance(config.robot, Path):
+            checks.check_unchanged(config.robot)
+        if config.object:
+            raise UsageError(
+                f"object is {config.object}; {_name(self._cls)} has its own, so omit --task.object"
+            )
+        world = self._cls(task)
+        own = settings_of(world, None if world.fps and world.horizon else world.make())
+        fixed = {"control_hz": own["fps"], "tolerance": _TOLERANCE, "success_steps": 1}
+        for name, value in fixed.items():
+            given = getattr(config, name)
+            if given not in (0, value):
+                raise UsageError(
+                    f"{name} is {given:g}; {_name(world)} has its own, expected {value:g}"
+                )
+        horizon = config.horizon or own["horizon"]
+        return replace(config, task=task or _name(world), horizon=horizon, **fixed)
+
+    def _task(self, config: EnvConfig) -> str:
+        """Return the chosen task; "" if the world has only one."""
+        asked = str(config.task)
+        if not self._cls.tasks:
+            if asked not in (EnvConfig.task, "", _name(self._cls)):
+                raise UnknownName(f"task of {_name(self._cls)}", asked, [_name(self._cls)])
+            return ""
+        if asked not in self._cls.tasks:
+            raise UnknownName(f"task of {_name(self._cls)}", asked, self._cls.tasks)
+        return asked
+
+    @override
+    def environment(
+        self, config: EnvConfig, cameras: CameraConfig | None, conditions: Sequence[Condition]
+    ) -> GymEnv:
+        """Return an environment.
+
+        Args:
+            config: Its settings, complete; the class has its own for all but task and horizon.
+            cameras: Cameras rendered in every step; None for none.
+            conditions: Without ranges, as these environments cannot be varied.
+        """
+        return GymEnv(self._cls(self._task(config)), cameras, config.horizon)
+
+    @override
+    def expert(self, config: EnvConfig) -> GymExpert:
+        return GymExpert(self._cls, self._task(config))
+
+    @override
+    def drawing_version(self, config: EnvConfig) -> int:
+        return DRAWN
+
+    @override
+    def fingerprint(self, config: EnvConfig) -> dict[str, str]:
+        settings, env = asdict(config), self.environment(config, None, ())
+        del settings["object"]  # there is none
+        settings["robot"] = _name(self._cls)
+        inner = env.env.unwrapped
+        package = type(inner).__module__.partition(".")[0]
+        sold = [f"{name} {version(name)}" for name in packages_distributions().get(package, [])]
+        simulated = simulation(env.env)
+        model = model_bytes(simulated[0]) if simulated else b""
+        own = {"world_sha256": hashlib.sha256(_source(self._cls)).hexdigest()}
+        return environment_fingerprint(model, settings) | own | {"package": ", ".join(sold)}
+
+
+def own_kind(robot: Path | str) -> GymKind | None:
+    """Return the kind of a user's own world: of a file, or of an installed package's entry point;
+    None if nothing has this name.
+    """
+    if isinstance(robot, Path):
+        return GymKind(own_class(robot.absolute(), GymWorld, "manip_il.GymWorld (docs/new-env.md)"))
+    for found in entry_points(group=WORLD_GROUP, name=robot):
+        try:
+            return GymKind(found.load())
+        except Exception as error:
+            raise UsageError(
+                f"world {robot} of {found.value} cannot be imported: {checks.one_line(error)}"
+            ) from error
+    return None
+
+
+def settings_of(world: GymWorld, env: gymnasium.Env[Any, Any] | None) -> dict[str, Any]:
+    """Return rate [Hz] and horizon of a world, from its class or its environment.
+
+    Args:
+        world: The world.
+        env: Its environment; None if the class gives both.
+
+    Raises:
+        UsageError: if neither gives one.
+    """
+    limit = getattr(getattr(env, "spec", None), "max_episode_steps", None)
+    found = {
+        "fps": world.fps or (env.metadata.get("render_fps", 0) if env is not None else 0),
+        "horizon": world.horizon or limit or 0,
+    }
+    for name, value in found.items():
+        if not value:
+            raise UsageError(f"{_name(world)} has no {name}; give its class one")
+    return found
+
+
+def _source(cls: type[GymWorld]) -> bytes:
+    return Path(inspect.getfile(cls)).read_bytes()
+
+
+def _name(world: GymWorld | type[GymWorld]) -> str:
+    cls = world if isinstance(world, type) else type(world)
+    return cls.name or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+
+
+def _names(world: GymWorld, key: str, count: int) -> tuple[str, ...]:
+    """Return the names of the numbers of a key."""
+    given = tuple(world.names.get(key, ()))
+    if given and len(given) != count:
+        raise UsageError(f"names of {key} of {_name(world)} are {len(given)}; expected {count}")
+    return given or tuple(f"{key}_{place}" for place in range(count))
+
+
+def _overrides(world: GymWorld, name: str) -> bool:
+    return getattr(type(world), name) is not getattr(GymWorld, name)
+
+
+def _actions(world: GymWorld, space: Any) -> GymActions:
+    if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+        raise UsageError(f"actions of {_name(world)} are {space}; expected a flat Box")
+    low, high = (np.asarray(one, np.float64) for one in (space.low, space.high))
+    scale = np.where(np.isfinite(high - low), high - low, 1.0)
+    names = _names(world, "action", len(low))
+    return GymActions(names, low, high, scale, np.zeros(len(low), bool))

@@ -1,0 +1,127 @@
+"""Meta-World's fifty tasks as LeRobot's environment makes them, with the scripts of the package.
+
+Yu et al. 2019, "Meta-World: A benchmark and evaluation for multi-task and meta reinforcement
+learning". What is trained here is measured by `lerobot-eval --env.type=metaworld`.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import ManipError
+from manip_il.mdp import F64
+from manip_il.sim.config import CameraConfig
+from manip_il.worlds.gym.drawing import painted
+from manip_il.worlds.gym.environment import GymKind
+from manip_il.worlds.gym.restoring import simulation
+from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
+
+INSTALL = "pip install --no-deps metaworld==3.0.0"
+SEED = 42  # of the task that LeRobot's environment takes
+CAMERA, CAMERA_AT = "corner2", (0.75, 0.075, 0.7)  # LeRobot's place of it [m]
+ROBOT = 4  # numbers of the observation that are the robot's: hand (3,) [m], and gripper
+
+
+@cache
+def _known() -> dict[str, Any]:
+    """Return LeRobot's tables of the tasks: texts, difficulties, scripts."""
+    found = find_spec("lerobot.envs")
+    assert found is not None
+    assert found.submodule_search_locations is not None
+    [folder] = found.submodule_search_locations
+    return json.loads((Path(folder) / "metaworld_config.json").read_text())
+
+
+class Metaworld(GymWorld):
+    """One of the fifty tasks, on its own robot, a Sawyer."""
+
+    name = "metaworld"
+    fps = 80
+    horizon = 500
+    cameras = (CAMERA,)
+
+    def __init__(self, task: str = ""):
+        super().__init__(task)
+        self.instruction = _known()["TASK_DESCRIPTIONS"].get(task, "")
+        self._script: Any = None
+
+    @override
+    def make(self) -> Any:
+        metaworld = _package("metaworld")
+        only = metaworld.MT1(self.task, seed=SEED)
+        env = only.train_classes[self.task](render_mode="rgb_array", camera_name=CAMERA)
+        env.set_task(only.train_tasks[0])
+        env.model.camera(CAMERA).pos[:] = CAMERA_AT
+        env.reset()
+        env._freeze_rand_vec = False
+        env.seeded_rand_vec = True
+        script = _known()["TASK_POLICY_MAPPING"][self.task]
+        self._script = getattr(_package("metaworld.policies"), script)()
+        return env
+
+    @override
+    def reset(self, env: Any, seed: int) -> tuple[F64, dict[str, Any]]:
+        env.seed(seed)
+        return env.reset(seed=seed)
+
+    @override
+    def observe(self, env: Any, seen: F64) -> dict[str, F64]:
+        return {AGENT: seen[:ROBOT], AROUND: seen[ROBOT:]}
+
+    @override
+    def solved(self, env: Any, info: Mapping[str, Any]) -> bool:
+        return bool(info.get("success", False))
+
+    @override
+    def act(self, env: Any, seen: F64) -> F64:
+        return np.clip(self._script.get_action(seen), -1.0, 1.0)
+
+    @override
+    def positions(self, env: Any) -> dict[str, F64]:
+        return {"hand": env.tcp_center, "object": env._get_pos_objects()[:3]}
+
+    @override
+    def render(self, env: Any, camera: str, cameras: CameraConfig) -> NDArray[np.uint8]:
+        simulated = simulation(env)
+        assert simulated is not None
+        # LeRobot turns its pictures by half a turn
+        return painted(type(self), self.task, simulated, camera, cameras)[::-1, ::-1]
+
+
+Metaworld.tasks = tuple(_known()["TASK_POLICY_MAPPING"])
+
+
+def _package(name: str) -> Any:
+    # its scripts warn of commands that they expect to be clipped
+    warnings.filterwarnings("ignore", module=r"metaworld\.")
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        raise ManipError(
+            f"metaworld needs {error.name}, which is not installed: {INSTALL}"
+        ) from error
+
+
+class MetaworldKind(GymKind):
+    """Meta-World's tasks, which LeRobot's evaluator also runs."""
+
+    @override
+    def own_files(self, spec: Any, shape: str) -> list[str]:
+        return [] if spec.task in Metaworld.tasks else ["--env.task=TASK"]
+
+    @override
+    def lerobot_words(self, robot: str, task: str) -> list[str]:
+        return ["--env.type=metaworld", f"--env.task={task}"]
+
+
+WORLD = MetaworldKind(Metaworld)
