@@ -19,7 +19,13 @@ from manip_il.collect.workers import Engine, engine_of
 from manip_il.data.atomic import require_replaceable
 from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
-from manip_il.data.journal import Journal, episode_path, list_seeds, read_journal
+from manip_il.data.journal import (
+    Journal,
+    episode_path,
+    journals_of,
+    list_seeds,
+    read_journal,
+)
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import policy_folder
@@ -232,8 +238,3 @@ def record(
         recording.write(journals)
         recording.make(made, root, replace=resume)
     return Dataset.open(root)
-
-
-def journals_of(root: Path) -> Path:
-    """Return the folder of the journals from which a dataset is made."""
-    return root.with_name(f"{root.name}.journals")

@@ -169,3 +169,8 @@ def _to_texts(journal: Journal, episode: Episode) -> dict[str, str]:
     }
     values |= {"drawn": dict(episode.drawn)} if episode.drawn else {}
     return {"format": _FORMAT} | {name: json.dumps(value) for name, value in values.items()}
+
+
+def journals_of(root: Path) -> Path:
+    """Return the folder next to a dataset that holds its journals; it may not exist."""
+    return root.absolute().with_name(f"{root.absolute().name}.journals")

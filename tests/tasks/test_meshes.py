@@ -125,7 +125,7 @@ def test_data_have_its_name_and_hash_and_no_path(folder, tmp_path):
     moved = tmp_path / "mug.obj"
     moved.write_bytes((folder / "mug.obj").read_bytes())
     assert env_fingerprint(make_config("panda", object=f"mesh:{moved}:0.06")) == before
-    assert world_of("panda").own_files("panda", "pick_place", spec.object)
+    assert world_of("panda").own_files(spec, spec.object)
     with pytest.raises(
         UsageError,
         match=r"name of the mesh was stored; give --task\.object=mesh:PATH/mug\.obj:0\.06",

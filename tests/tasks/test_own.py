@@ -15,8 +15,10 @@ import zstandard
 import manip_il
 from manip_il.cli.main import main
 from manip_il.collect.edits import open_source
+from manip_il.collect.inputs import own_files
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
+from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
 from manip_il.robots import table as robots
@@ -24,7 +26,7 @@ from manip_il.sim.render import point_names
 from manip_il.tasks import table
 from manip_il.tasks.table import get_task
 from manip_il.worlds.ladder.world import scene_of
-from manip_il.worlds.table import env_fingerprint, env_spec, make_config, world_of
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..meshes import write_mesh
 
@@ -149,8 +151,8 @@ def test_data_and_results_name_a_task_and_run_nothing(touch, tmp_path, monkeypat
     words = ["--dataset.num_episodes=2", "--dataset.root=data", "--workers=1"]
     assert main(["record", f"--task.type={touch}", *words]) == 0
     assert main(["data", "check", "data"]) == 0
-    assert world_of("panda").own_files("panda", "touch", "")
-    with pytest.raises(ManipError, match="unknown task 'touch'"):
+    assert own_files(Dataset.open(tmp_path / "data").spec) == ["--task.type=FILE.py"]
+    with pytest.raises(ManipError, match=r"a file of your own; give --task\.type=FILE\.py$"):
         open_source(tmp_path / "data")
     assert open_source(tmp_path / "data", task=touch).warnings == ()
     assert main(["eval", "--policy.type=expert", f"--task.type={touch}", "--eval.n_episodes=2", "--eval.films=0",
