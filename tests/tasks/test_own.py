@@ -95,7 +95,7 @@ def test_a_node_gets_the_files_of_task_and_mesh(tmp_path):
     [here] = list(job.run([5]))
     mesh.unlink()
     away = replace(job, env=replace(own, object=Path(f"mesh:{tmp_path / 'away' / mesh.name}")))
-    answer = run_there(manip_il.__version__, away, (5,), None, tasks, meshes)
+    answer = run_there(manip_il.__version__, away, (5,), None, None, tasks, meshes)
     [(there, _)] = pickle.loads(zstandard.decompress(answer))
     for name, column in here.without_pictures().columns.items():
         np.testing.assert_array_equal(there.columns[name], column)
