@@ -81,7 +81,7 @@ COMMANDS = {
     "robot check": ("robots:RobotCheckOptions", "measure what an arm can do, before recording"),
     "robot certify": ("robots:CertifyOptions", "measure from which states the expert recovers"),
     "env check": (
-        "robots:EnvCheckOptions:robots",
+        "robots:EnvCheckOptions:env",
         "does a world of your own keep the contract, and how good is its expert",
     ),
     "rl gail": (

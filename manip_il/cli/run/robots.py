@@ -7,7 +7,6 @@ from manip_il.cli.outputs import OutputFile, publish
 from manip_il.cli.progress import progress, say
 from manip_il.cli.robots import (
     CertifyOptions,
-    EnvCheckOptions,
     RobotCheckOptions,
     RobotNewOptions,
 )
@@ -23,7 +22,6 @@ from manip_il.evaluation.robot_check import (
     check_robot,
     verdict,
 )
-from manip_il.evaluation.world_check import check_world
 from manip_il.progress import Progress
 from manip_il.robots.found import suggest, yaml_of
 from manip_il.robots.gripper import sweep
@@ -98,15 +96,3 @@ def run_certify(options: CertifyOptions) -> None:
         mu = certificate.mu
         lines = () if mu is None else (f"u of Ross et al. (2011) is at least {mu} steps",)
         publish(folder / FILE_NAME, certificate.to_json(), [certificate.table()], *lines)
-
-
-def run_env_check(options: EnvCheckOptions) -> None:
-    """Print the checks. Raises `ManipError` if a part of the contract is not kept."""
-    config = env_config({"robot": options.world, "task": options.task})
-    failed = list[str]()
-    with progress(options.episodes, f"check {options.world}") as bar:
-        for check in check_world(config, options.episodes, bar.step):
-            say(str(check))
-            failed += [check.what] if check.advice else []
-    if failed:
-        raise ManipError(f"{options.world} does not keep the contract: {', '.join(failed)}")
