@@ -86,7 +86,8 @@ TRAIN, EXPERT = "train --dataset.root=SAMPLE", "eval --policy.type=expert"
 MISTAKES = {
     "data chekc a": "unknown command 'data chekc' (did you mean 'data check'?); known: ",
     "train": "--dataset.root is missing",
-    "train --dataset.root=missing": "missing is not a LeRobot dataset",
+    "train --dataset.root=missing": "missing does not exist; expected a LeRobot v3.0 dataset",
+    "data check missing": "missing does not exist; expected a LeRobot v3.0 dataset",
     f"train --dataset.root={ROOT / 'docs'}": "is not a LeRobot dataset: meta/info.json is missing",
     "train --dataset.root=lerobot/pusht": "manip-il pull hf://datasets/USER/NAME FOLDER",
     f"{TRAIN} --policy.path=missing": "no policy in missing",

@@ -17,7 +17,7 @@ from manip_il.data.info import NUMBERS
 from manip_il.data.lerobot_layout import DATA_FILES, INFO, STATS, write_json
 from manip_il.data.parquet_files import count_rows
 from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, to_lists
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UsageError
 
 Check = Callable[[Dataset], Iterator[Finding]]
 CHECKS: tuple[Check, ...] = (*files.CHECKS, *learning.CHECKS)
@@ -25,9 +25,10 @@ _PICTURES = 100  # pictures per camera from which statistics are computed
 
 
 def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
-    """Return all findings about a folder, [] for a sound dataset. Never raises.
+    """Return all findings about a folder, [] for a sound dataset.
 
-    If the folder is not a dataset, this is the only finding.
+    If the folder is not a dataset, this is the only finding. Raises only `UsageError`, if there is
+    no such folder.
 
     Args:
         root: The folder.
@@ -41,6 +42,8 @@ def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
                 found += check(dataset)
             except Exception as problem:  # a failing check must not hide the others
                 found.append(_explain(root, problem))
+    except UsageError:
+        raise
     except ManipError as problem:
         found.append(_explain(root, problem))
     return list(dict.fromkeys(found))  # several checks may report the same file
