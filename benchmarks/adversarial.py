@@ -32,7 +32,7 @@ from scipy.stats import trim_mean
 
 from manip_il.chapter.config import DiscriminatorConfig, PPOConfig
 from manip_il.chapter.discriminators import Discriminator
-from manip_il.chapter.episodes import ActionRange, Demonstrations, Lockstep, Transitions
+from manip_il.chapter.episodes import ActionRange, Demonstrations, Lockstep
 from manip_il.chapter.learning import airl, gail
 from manip_il.chapter.ppo import Learner, seed_generators
 from manip_il.learn.network import MLPNetwork, NetworkConfig, fit_statistics, threads
@@ -188,24 +188,21 @@ class Run:
     def begin(self, agent: Run) -> Iterator[Any]:
         return iter(())
 
-    def rollouts(self) -> Transitions:
+    def rollouts(self) -> None:
         count = self._settings.episodes
         self._number += 1
         seed_generators(self._stream("rollouts"))
-        rows = self._learner.collect(
+        self._rows = self._learner.collect(
             stream_seeds("reinforcement", (self._number + 1) * count, self._seed)[-count]
         )
         self.simulated += self._envs.simulated
-        return rows
 
-    def log_prob(self, rows: Transitions) -> F32:
-        return self._learner.log_prob(rows)
-
-    def discriminate(self, d: Discriminator, learner: Transitions) -> None:
+    def discriminate(self, d: Discriminator) -> F32:
         rng = rng_for(self._stream("discriminator"), "batches")
         expert = self._learner.explored(self._expert, rng)
-        log_probs = (self.log_prob(expert), self.log_prob(learner)) if d.asks_density else None
-        self.metrics = d.fit(expert, learner, log_probs, rng)
+        density, own = self._learner.log_prob(expert), self._learner.log_prob(self._rows)
+        self.metrics = d.fit(expert, self._rows, (density, own), rng)
+        return d.reward(self._rows, own)
 
     def improve(self, rewards: F32) -> None:
         remaining = max(0.0, 1.0 - self.simulated / self._settings.steps)

@@ -31,7 +31,7 @@ from lerobot.datasets import LeRobotDataset
 import datasets
 from manip_il.data.camera import decode
 from manip_il.data.dataset import Dataset
-from manip_il.learn.batches import Augment, pictures_to_float
+from manip_il.learn.batches import Augment, to_float
 from manip_il.learn.network import threads
 from manip_il.learn.samples import Samples, Windows
 
@@ -133,7 +133,7 @@ def our_epoch(samples: Samples, augment: Augment | None, number: Iterator[int]) 
     for rows in np.split(order, range(BATCH, count, BATCH)):
         batch = samples.batch(rows)
         if augment is None:
-            pictures_to_float(batch, samples.pictures)
+            batch |= {key: to_float(batch[key]) for key in samples.pictures}
         else:
             for key in samples.pictures:
                 batch[key] = augment(batch[key], generator)

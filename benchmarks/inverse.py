@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from manip_il.chapter.inverse import CARRY, METHODS, learn, read_carried
 from manip_il.cli.main import main as manip_il
 from manip_il.seeding import rng_for, stream_base, stream_seeds
-from manip_il.tasks.carry.grid import Grid, PathProblem, cheapest_path, plan
+from manip_il.tasks.carry.grid import Grid, PathProblem, plan
 from manip_il.tasks.carry.layout import TASTES
 from manip_il.tasks.carry.obstacles import layout_of
 from manip_il.tasks.pick_place import OBJECT
@@ -64,7 +64,7 @@ def main() -> int:
                 "length": plain,
                 **{m: w for m, (w, _) in found.items()},
             }.items():
-                sums = cheapest_path(problem, plan(problem, weights), start)[1]
+                sums = plan(problem, weights).path(start)[1]
                 costs.setdefault((taste, name), []).append(float(sums @ truth))
     missed = _print(learnt, {key: float(np.mean(values)) for key, values in costs.items()})
     return int(missed and not options.quick)
@@ -77,7 +77,7 @@ def unseen(robot: str, count: int, seed: int) -> Iterator[tuple[PathProblem, int
     env = env_of(make_config(robot, CARRY))
     for one in stream_seeds("held_out", count, seed):
         env.reset(seed=one)
-        grid = Grid(layout_of(env.world, OBJECT), env.world.scene.robot)
+        grid = Grid(layout_of(env.world), env.world.scene.robot)
         at = env.world.pose(OBJECT).position
         near = grid.near(at)
         yield grid.problem, int(near[np.argmin(np.linalg.norm(grid.points[near] - at, axis=1))])

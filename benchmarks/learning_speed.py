@@ -97,10 +97,9 @@ def measure(
     found = []
     for _ in range(iterations):
         times = [time.process_time()]
-        steps = agent.rollouts()
+        agent.rollouts()
         times.append(time.process_time())
-        agent.discriminate(d, steps)
-        agent.improve(d.reward(steps))
+        agent.improve(agent.discriminate(d))
         run.finish(agent)
         times.append(time.process_time())
         for episode in recorded:

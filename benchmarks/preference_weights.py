@@ -161,9 +161,8 @@ def fresh_agreement(rounds: Path, reward: Path, count: int) -> Proportion:
     progress.
     """
     clips = choose_pairs(find_datasets([rounds]), _CLIP, count, 0, np.random.default_rng(999))
-    returns = LearnedReward.load(reward / PRETRAINED_MODEL)(clips.inputs)[clips.rows].sum(-1)
+    returns = LearnedReward.load(reward / PRETRAINED_MODEL)(clips.data.inputs)[clips.rows].sum(-1)
     difference = true_difference(clips)
-    assert difference is not None
     told = np.abs(difference) >= TIE
     return Proportion.of((((returns[:, 0] - returns[:, 1]) > 0) == (difference > 0))[told].tolist())
 

@@ -172,7 +172,7 @@ def _cost(env: EnvConfig, episode: Episode, names: Sequence[str], truth: Reward)
         return np.inf
     seen = episode.columns[ENVIRONMENT_STATE].astype(np.float64)
     scene = scene_of(env.robot, CARRY, env.object)
-    layout = observed_layout(scene, OBJECT, dict(zip(names, seen[0].tolist(), strict=True)))
+    layout = observed_layout(scene, dict(zip(names, seen[0].tolist(), strict=True)))
     at = seen[:, [names.index(f"{OBJECT}.{axis}") for axis in "xyz"]]
     return float(
         path_features(layout, carried_stretch(at, np.array(layout.goal))) @ np.array(truth.weights)

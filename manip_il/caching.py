@@ -7,22 +7,17 @@ import threading
 from collections.abc import Callable
 
 
-class PerThread[**P, R]:
+class PerThread[**P, R](threading.local):
     """`functools.lru_cache`, except that a value belongs to the thread that made it.
 
     Two threads that shared one world or one solver would compute with each other's numbers.
+
+    Attributes:
+        own: The calling thread's cache.
     """
 
     def __init__(self, function: Callable[P, R], size: int | None):
-        self._function, self._size = function, size
-        self._own = threading.local()
-
-    @property
-    def own(self) -> functools._lru_cache_wrapper[R]:
-        """The calling thread's cache."""
-        if not hasattr(self._own, "cache"):
-            self._own.cache = functools.lru_cache(self._size)(self._function)
-        return self._own.cache
+        self.own = functools.lru_cache(size)(function)  # called again in every thread
 
     def __call__(self, *arguments: P.args, **options: P.kwargs) -> R:
         """Return the function's value for these arguments."""

@@ -1,5 +1,6 @@
 """Options for users: dataclass fields with a line of help, which the command line shows."""
 
+import contextlib
 import math
 import numbers
 import sys
@@ -102,19 +103,14 @@ def check_bounds(options: Any, prefix: str = "") -> None:
         UsageError: A value has the wrong type or is out of bounds.
     """
     for one in fields(options):
-        value = getattr(options, one.name)
-        _check_type(prefix + one.name, value, one, type(options))
-        check_bound(prefix + one.name, value, one.metadata)
-
-
-def _check_type(name: str, value: Any, one: Field[Any], cls: type) -> None:
-    try:
-        kind = type_of(cls, one)
-    except NameError:  # a name that only type checkers import
-        return
-    if not _is_of(value, kind):
-        known = kind.__name__ if isinstance(kind, type) else str(kind).replace("typing.", "")
-        raise UsageError(f"{name} is {shorten(value)}; expected {known}")
+        name, value = prefix + one.name, getattr(options, one.name)
+        kind: Any = object
+        with contextlib.suppress(NameError):  # a name that only type checkers import
+            kind = type_of(type(options), one)
+        if not _is_of(value, kind):
+            known = kind.__name__ if isinstance(kind, type) else str(kind).replace("typing.", "")
+            raise UsageError(f"{name} is {shorten(value)}; expected {known}")
+        check_bound(name, value, one.metadata)
 
 
 def type_of(cls: type, one: Field[Any]) -> Any:

@@ -1,11 +1,12 @@
 """The one place that runs a Python file of the user's own, to get the class that it describes."""
 
 import hashlib
-import importlib.util
 import inspect
 import sys
 from functools import cache
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
+from types import ModuleType
 
 from manip_il import checks
 from manip_il.errors import OWN, UsageError
@@ -26,20 +27,21 @@ def own_class[T](path: Path, base: type[T], wanted: str) -> type[T]:
     if not path.is_file():
         raise UsageError(f"{path} does not exist; expected a Python file with your own {wanted}")
     name = f"{OWN}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None  # because the path ends in `.py`
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look it up there
+    module = sys.modules[name] = ModuleType(name)  # dataclasses look it up there
+    module.__file__ = str(path)
     try:
-        spec.loader.exec_module(module)
+        SourceFileLoader(name, str(path)).exec_module(module)
     except Exception as error:
         del sys.modules[name]
         raise UsageError(
             f"{path} cannot be run: {type(error).__name__}: {checks.one_line(error)}"
         ) from error
-    own = [one for one in vars(module).values() if inspect.isclass(one) and one.__module__ == name]
-    found = [cls for cls in own if issubclass(cls, base) and not cls.__name__.startswith("_")]
+    found = [
+        value
+        for key, value in vars(module).items()
+        if inspect.isclass(value) and issubclass(value, base) and value.__module__ == name
+        if not key.startswith("_")
+    ]
     if len(found) != 1:
         names = ", ".join(cls.__name__ for cls in found) or "none"
         raise UsageError(f"{base.__name__}s in {path}: {names}; expected one subclass of {wanted}")

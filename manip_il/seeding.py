@@ -10,7 +10,7 @@ import zlib
 
 import numpy as np
 
-from manip_il.errors import UsageError
+from manip_il.errors import UnknownName, UsageError
 
 BLOCK = 1_000_000  # seeds in one stream
 MAX_ROUNDS = 100
@@ -39,6 +39,7 @@ def stream_base(stream: str, seed: int = 0) -> int:
 
     Raises:
         UsageError: The seed is out of range.
+        UnknownName: There is no such stream.
     """
     if not 0 <= seed <= MAX_SEED:
         raise UsageError(f"seed is {seed}; expected a whole number from 0 to {MAX_SEED}")
@@ -74,6 +75,8 @@ def rng_for(seed: int, purpose: str, *step: int) -> np.random.Generator:
 
 def _block(stream: str) -> int:
     kind, _, number = stream.partition("/")
-    if kind == "round" and int(number) < MAX_ROUNDS:
+    if kind == "round" and number.isdecimal() and int(number) < MAX_ROUNDS:
         return _FIRST_ROUND + int(number)
+    if stream not in _STREAMS:
+        raise UnknownName("stream of seeds", stream, [*_STREAMS, "round/0 to 99"])
     return _STREAMS[stream]

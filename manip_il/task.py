@@ -23,9 +23,16 @@ from manip_il.tasks.ladder import (
     pick_rungs,
     rise_first,
 )
-from manip_il.tasks.objects import add_cube, add_furniture, add_goal, add_object, add_part
-from manip_il.tasks.pick_place import PickPlace, observe_object
-from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.objects import (
+    add_cube,
+    add_furniture,
+    add_goal,
+    add_object,
+    add_part,
+    observe_hand,
+    observe_object,
+)
+from manip_il.tasks.pick_place import PickPlace
 from manip_il.tasks.starts import UPRIGHT, draw_goal, draw_lying, draw_resting, draw_until, draw_yaw
 
 __all__ = [

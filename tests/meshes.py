@@ -1,4 +1,4 @@
-"""Ten objects as meshes, made of numbers: each function returns a closed `Trimesh` in metres, z
+"""Nine objects as meshes, made of numbers: each function returns a closed `Trimesh` in metres, z
 up.
 """
 
@@ -23,53 +23,18 @@ def prism(
     return trimesh.Trimesh(points, faces)
 
 
-def tube(
-    way: Sequence[tuple[float, float, float]], radii: Sequence[float], sides: int = 16
-) -> trimesh.Trimesh:
-    """A tube along a way in the plane of x and z, with a tip at either end."""
-    path, rings = np.asarray(way, float), []
-    for at, along, radius in zip(path, np.gradient(path, axis=0), radii, strict=True):
-        across = np.cross((0, 1.0, 0), along / np.linalg.norm(along))
-        angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
-        rings.append(
-            at + radius * (np.outer(np.cos(angles), across) + np.outer(np.sin(angles), (0, 1.0, 0)))
-        )
-    ring, last = np.arange(sides), (len(path) - 1) * sides
-    after, faces = np.roll(ring, -1), []
-    for start in range(0, last, sides):
-        a, b = start + ring, start + after
-        faces += [*np.c_[a, b, a + sides], *np.c_[b, b + sides, a + sides]]
-    ends = len(path) * sides
-    faces += [
-        *np.c_[after, ring, np.full(sides, ends)],
-        *np.c_[last + ring, last + after, np.full(sides, ends + 1)],
-    ]
-    solid = trimesh.Trimesh(np.vstack([*rings, path[0], path[-1]]), np.array(faces))
-    solid.fix_normals()
-    return solid
-
-
 def mug() -> trimesh.Trimesh:
     cup = revolve(
         [(0, 0), (0.027, 0), (0.027, 0.065), (0.024, 0.065), (0.024, 0.004), (0, 0.004)],
         sections=32,
     )
-    turn = np.linspace(-np.pi / 2, np.pi / 2, 9)
-    handle = tube(
-        [(0.0255 + 0.016 * np.cos(t), 0, 0.033 + 0.02 * np.sin(t)) for t in turn], [0.004] * 9
-    )
+    handle = box((0.018, 0.008, 0.04)).apply_translation((0.035, 0, 0.033))
     return trimesh.util.concatenate([cup, handle])
 
 
 def bottle() -> trimesh.Trimesh:
     outline = [(0, 0), (0.022, 0), (0.022, 0.065), (0.011, 0.085), (0.011, 0.105), (0, 0.105)]
     return revolve(outline, sections=32)
-
-
-def banana() -> trimesh.Trimesh:
-    turn = np.linspace(-0.85, 0.85, 15)
-    way = [(0.07 * np.sin(t), 0.0, 0.07 * (1 - np.cos(t))) for t in turn]
-    return tube(way, 0.004 + 0.011 * np.cos(turn * np.pi / 1.9))
 
 
 def angle() -> trimesh.Trimesh:
@@ -118,7 +83,6 @@ def ring() -> trimesh.Trimesh:
 MESHES: dict[str, Callable[[], trimesh.Trimesh]] = {
     "mug": mug,
     "bottle": bottle,
-    "banana": banana,
     "angle": angle,
     "wedge": wedge,
     "star": star,

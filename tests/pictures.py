@@ -118,9 +118,9 @@ def read_episodes(root: Path) -> Iterator[Episode]:
     dataset = Dataset.open(root)
     shapes = {key: one["shape"] for key, one in s.features(dataset.spec).items()}
     names = [key for key in shapes if key not in dataset.spec.image_keys]
-    for one in dataset.stored_episodes(names):
+    for number, one in enumerate(dataset.stored_episodes(names)):
         columns = {
-            key: dataset.frames(key, dataset.rows_of(one.number)) for key in dataset.spec.image_keys
+            key: dataset.frames(key, dataset.rows_of(number)) for key in dataset.spec.image_keys
         }
         columns |= {key: one.columns[key].reshape(-1, *shapes[key]) for key in names}
         solved, drawn = columns[s.SUCCESS], json.loads(one.others[lerobot_layout.DRAWN] or "{}")

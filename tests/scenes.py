@@ -80,6 +80,17 @@ def drive(env: ManipEnv, steps: int) -> None:
         env.advance(expert.label(env.get_state()).action)
 
 
+def solve(env: ManipEnv) -> list[str]:
+    """Let the expert solve the task; return the phases on the way."""
+    expert, names, seen = Expert(env.scene), phases(env.scene.task), list[str]()
+    while not env.solved:
+        assert env.get_state().step < env.config.horizon
+        label = expert.label(env.get_state())
+        seen.append(names[label.phase])
+        env.advance(label.action)
+    return seen
+
+
 def drive_until(env: ManipEnv, phase: str) -> None:
     """Let the expert drive until its label is of a phase."""
     expert, names = Expert(env.scene), phases(env.scene.task)

@@ -43,6 +43,13 @@ MISTAKES: dict[str, Callable[[Path], object]] = {
     "unknown option 'roundz' (did you mean 'rounds'?)": lambda folder: manip_il.dagger(
         folder, "panda", roundz=3
     ),
+    "the weights of 1 datasets are [1, 2]; expected a number above 0 for each": lambda folder: (
+        manip_il.train(SAMPLE, folder / "run", shares=[1, 2])
+    ),
+    "give it alone, without shares": lambda folder: manip_il.train(
+        SAMPLE, folder / "run", shares=[1], weights=folder / "rabc.parquet"
+    ),
+    "no dataset was given": lambda folder: manip_il.train([], folder / "run"),
     "is not a LeRobot dataset": lambda folder: manip_il.train(folder, folder / "clone"),
 }
 
@@ -75,7 +82,7 @@ def test_nothing_is_recorded_over_what_is_there(tmp_path: Path):
     with pytest.raises(UsageError, match=str(tmp_path)):
         manip_il.dagger(tmp_path, RunConfig(env))
     with pytest.raises(UsageError, match=str(tmp_path)):
-        manip_il.train([], tmp_path)
+        manip_il.train(SAMPLE, tmp_path)
     assert (tmp_path / "metrics.jsonl").read_text() == "mine\n"
 
 

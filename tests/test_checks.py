@@ -16,7 +16,7 @@ from manip_il.data.journal import read_journal
 from manip_il.data.parquet_files import count_rows, read_file
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.network import read_weights
-from manip_il.robots.files import ModelFiles
+from manip_il.robots.robot import ModelFiles
 
 
 @pytest.mark.parametrize(

@@ -28,13 +28,6 @@ def test_no_control_character_of_a_name_reaches_a_terminal(capsys: pytest.Captur
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-@pytest.mark.parametrize(
-    "value", [None, 1.5, "it's", "x" * 150, b"x" * 150, (1,), [], {"a": 1, "b": [{}, ()]}]
-)
-def test_a_short_value_is_shown_as_python_prints_it(value):
-    assert shorten(value) == repr(value)
-
-
 def test_a_huge_structure_is_not_printed_as_a_whole():
     value: object = "x"
     for _ in range(60):  # 9^60 values

@@ -112,9 +112,12 @@ def test_one_function_runs_a_users_file_and_one_place_calls_it():
         "execfile",
     )
     assert {(file, function) for file, function, _ in calls(*files)} == {
-        ("tasks/table.py", "_of_file")
+        ("own_file.py", "own_class")
     }
-    assert calls("_of_file") == {("tasks/table.py", "get_task", "_of_file")}
+    assert calls("own_class") == {
+        ("tasks/table.py", "_of_file", "own_class"),
+        ("worlds/gym/environment.py", "own_kind", "own_class"),
+    }
 
 
 def test_other_code_is_found_by_the_packages_own_tables_alone():

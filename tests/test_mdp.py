@@ -29,14 +29,6 @@ def test_a_state_survives_its_vector_bit_for_bit(
     assert (again.step, again.streak, again.ever) == (step, streak, ever)
 
 
-def test_a_state_from_a_vector_owns_its_numbers():
-    vector = State(np.ones(5), np.ones(3)).to_vector()
-    state = State.from_vector(vector)
-    vector[:] = 7
-    np.testing.assert_array_equal(state.physics, np.ones(5))
-    np.testing.assert_array_equal(state.variation, np.ones(3))
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize(
     ("make", "words"),

@@ -45,7 +45,7 @@ ALLOWED = {
     "worlds/fingerprint.py": "the kernel's files of the processor",
     "data/atomic.py": "locks and flushes what it writes",
     "chapter/learning.py": "the state of a run's own last checkpoint",
-    "robots/files.py": "a user's model, after its included files were read",
+    "robots/robot.py": "a user's model, after its included files were read",
     "serve/operator.py": "the kernel's file of this process",
     "sim/scene.py": "the empty scene, which ships with the package",
     "worlds/aloha/expert.py": "a model in an installed package",

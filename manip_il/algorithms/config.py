@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,9 @@ from manip_il.worlds.table import env_spec, make_config
 if TYPE_CHECKING:  # so that `manip-il dagger --help` does not import numpy
     from manip_il.collect.query import Query
     from manip_il.sim.conditions import Condition
+
+
+_BOUNDS = {"constant": (0, 1), "linear": (1, math.inf), "exponential": (0, 1)}
 
 
 @dataclass(frozen=True)
@@ -41,20 +45,14 @@ class BetaSchedule:
             UsageError: The text is anything else.
         """
         kind, _, parameter = text.partition(":")
-        try:
-            number = float(parameter)
-        except ValueError:
-            number = math.nan
-        if not (
-            (kind == "linear" and number >= 1)
-            or (kind in ("constant", "exponential") and 0 <= number <= 1)
-        ):
-            kinds = (
-                "constant:B, linear:ROUNDS or exponential:B, with B from 0 to 1 and at least 1"
-                " round"
-            )
-            raise UsageError(f"beta is {text!r}; expected {kinds}")
-        return cls(kind, number)
+        lowest, highest = _BOUNDS.get(kind, (math.inf, -math.inf))
+        with contextlib.suppress(ValueError):
+            if lowest <= (number := float(parameter)) <= highest:
+                return cls(kind, number)
+        raise UsageError(
+            f"beta is {text!r}; expected constant:B, linear:ROUNDS or exponential:B, with B from 0"
+            " to 1 and at least 1 round"
+        )
 
     def __str__(self) -> str:
         return f"{self.kind}:{self.parameter:g}"
@@ -188,14 +186,11 @@ class RunConfig(Seeded):
             raise UsageError(
                 f"only the expert drives in {self.method!r}; leave out label, query and beta"
             )
-        if self.fit.takes_images and self.cameras is None:
+        if self.fit.takes_images != (self.cameras is not None):
+            seen = ",".join(self.cameras.names) if self.cameras else "none"
             raise UsageError(
-                "the policy takes images, but none are rendered; give --cameras=front,side,wrist"
-            )
-        if self.cameras is not None and not self.fit.takes_images:
-            raise UsageError(
-                "images are rendered, but the policy takes none; leave out --cameras or"
-                " --observation"
+                f"--observation={self.fit.observes} with --cameras={seen}; expected cameras, such"
+                " as front,side,wrist, if the policy takes images, and only then"
             )
         if self.method == "dart" and self.cameras is not None:
             raise UsageError(

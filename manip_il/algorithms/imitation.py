@@ -1,7 +1,6 @@
 """Run DAgger, or another algorithm of imitation, in a folder."""
 
 import json
-import logging
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -18,13 +17,10 @@ from manip_il.data.schema import SIM_STATE, check_same_spec, features
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.sources import check_same_sources
 from manip_il.option import make_options
 from manip_il.progress import Progress
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import env_fingerprint, env_of_name, env_spec
-
-_LOG = logging.getLogger(__name__)
 
 
 def dagger(
@@ -113,19 +109,13 @@ def check_inputs(config: RunConfig) -> None:
     for root in config.datasets:
         given = open_dataset(root)
         if SIM_STATE not in given.features:
-            advice = (
-                "train a policy on it with manip-il train, and start from that: --policy.path=RUN"
-            )
             raise ManipError(
-                f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; {advice}"
+                f"{root} has no {SIM_STATE}, so rollouts cannot be added to it; train a policy on"
+                " it with manip-il train, and start from that: --policy.path=RUN"
             )
-        check_same_sources(
-            (root, Path(run)),
-            (given.spec, here),
-            pictures=config.cameras is not None,
-            language=False,
-        )
-        check_same_spec(str(root), given.spec, run, here, ["sim_state_size"])
+        pictured = ("cameras", "image_size") if config.cameras else ()
+        also = ("task", "sim_state_size", *pictured)
+        check_same_spec(str(root), given.spec, run, here, also)
         if odd := sorted(features(given.spec).keys() ^ features(here).keys()):
             raise ManipError(
                 f"only one of {root} and this run has {', '.join(odd)}; expected the same --cameras"

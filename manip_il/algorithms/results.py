@@ -1,18 +1,19 @@
 """Results of a run: timing, one result per round or iteration, the best one, and the report."""
 
 import time
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from manip_il.data.atomic import read_lines
 from manip_il.errors import ManipError
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.eval_report import run_report
 from manip_il.evaluation.report import Report
 from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.evaluation.rounds import history
+from manip_il.evaluation.rounds import METRICS_FILE, history
 from manip_il.evaluation.side import Member, Side
 from manip_il.evaluation.tables import CLONING, DAGGER
 
@@ -84,15 +85,15 @@ class Result:
 
     def to_json(self) -> dict[str, Any]:
         """Return one line of `metrics.jsonl`."""
-        success = None if self.validated is None else self.validated.success
+        success = self.validated and self.validated.success
         return {
             self.unit: self.number,
             "steps": self.steps,
             "episodes": self.episodes,
             **self.metrics,
-            "validation_success": None if success is None else success.rate,
-            "validation_interval": None if success is None else list(success.interval),
-            "validation_episodes": None if success is None else success.n,
+            "validation_success": success and success.rate,
+            "validation_interval": success and list(success.interval),
+            "validation_episodes": success and success.n,
             "seconds": self.seconds,
         }
 
@@ -119,16 +120,17 @@ def best_validation(found: Mapping[int, EvalResult]) -> int:
 
 
 def validation_report(
-    title: str, first: str, found: Mapping[int, EvalResult], records: Sequence[Mapping[str, Any]]
+    folder: Path, title: str, first: str, found: Mapping[int, EvalResult]
 ) -> Report:
     """Return the report of a run.
 
     Args:
-        title: Of the page.
+        folder: The run's folder.
+        title: The page's title.
         first: Name of the policy with number 0.
         found: Validations by round or iteration, at least one.
-        records: Lines of `metrics.jsonl`.
     """
+    records = read_lines(folder / METRICS_FILE)
     best, runs = best_validation(found), history(records, title)
     labels = {one["round"]: one["labels"] for one in records if "round" in one}
     names = {number: f"{runs[0].unit} {number}" for number in found} | {0: first}

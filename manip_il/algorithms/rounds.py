@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from manip_il.algorithms.config import RunConfig
-from manip_il.collect.drivers import ExpertDriver, PolicyDriver
+from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.edits import Scenes
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import journal_of
@@ -97,11 +97,19 @@ def mixture(policy: Fitted, beta: float) -> PolicyDriver:
     return PolicyDriver.of(*policy.members, beta=beta, trust=policy.trust)
 
 
-def expert_job(config: RunConfig, round_: int) -> RolloutJob:
-    """Return the job of the expert's rollouts in a round."""
+def round_job(config: RunConfig, round_: int, **more: Any) -> RolloutJob:
+    """Return the job of a round's rollouts, by default of the expert's. more: other fields of
+    `RolloutJob`.
+    """
     cameras = None if config.redraw else config.cameras  # redrawing needs states only
-    job = RolloutJob(config.env, ExpertDriver(), config.hold, round=round_, cameras=cameras)
-    return replace(job, conditions=config.conditions)
+    return RolloutJob(
+        config.env,
+        hold=config.hold,
+        round=round_,
+        cameras=cameras,
+        conditions=config.conditions,
+        **more,
+    )
 
 
 def record_round(
@@ -136,14 +144,26 @@ def read_rollouts(folder: Path, round_: int, beta: float, *, queried_everywhere:
         queried_everywhere: Whether the expert was queried in every state; if not, every label
             counts as a query.
     """
-    episodes = (read_journal(path)[1] for path in list_episodes(folder / JOURNALS))
-    ends = [(len(episode), episode.success) for episode in episodes]
+    ends = journal_ends(folder / JOURNALS)
     dataset = folder / DATASET if (folder / DATASET).is_dir() else None
     labels = _count_labels(dataset) if dataset else 0
     steps = sum(length for length, _ in ends)
-    queries = steps if queried_everywhere else labels
-    successes = sum(success for _, success in ends)
-    return Rollouts(round_, dataset, beta, labels, queries, len(ends), successes, steps)
+    return Rollouts(
+        round_,
+        dataset,
+        beta,
+        labels,
+        queries=steps if queried_everywhere else labels,
+        episodes=len(ends),
+        successes=sum(success for _, success in ends),
+        steps=steps,
+    )
+
+
+def journal_ends(journals: Path) -> list[tuple[int, bool]]:
+    """Return the length and the success of every episode in a folder of journals."""
+    episodes = (read_journal(path)[1] for path in list_episodes(journals))
+    return [(len(episode), episode.success) for episode in episodes]
 
 
 def given_rollouts(folder: Path, datasets: Sequence[Path]) -> Rollouts:
@@ -168,11 +188,8 @@ def merge_rounds(datasets: Sequence[Path], root: Path, best: int) -> None:
         root: The folder of the merged dataset.
         best: The number of the best round, for the provenance.
     """
-
-    def episodes(dataset: Path) -> int:
-        return Dataset.open(dataset).info.episodes
-
-    if datasets and not (root.is_dir() and episodes(root) == sum(map(episodes, datasets))):
+    made = sum(Dataset.open(one).info.episodes for one in datasets)
+    if datasets and not (root.is_dir() and Dataset.open(root).info.episodes == made):
         merge_datasets(datasets, root, provenance={"best_round": best}, replace=True)
 
 

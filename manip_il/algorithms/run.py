@@ -26,14 +26,15 @@ from manip_il.algorithms.rounds import (
     Fitted,
     Rollouts,
     begin_with,
-    expert_job,
     fit_round,
     given_rollouts,
+    journal_ends,
     merge_rounds,
     read_rollouts,
     record_round,
     round_fit,
     round_folder,
+    round_job,
     round_scenes,
 )
 from manip_il.collect.drivers import Driver, PolicyDriver
@@ -45,10 +46,9 @@ from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.atomic import CHECKPOINT, append_line, new_folder, read_lines
 from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
-from manip_il.data.journal import list_episodes, read_journal
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import METRICS_FILE
-from manip_il.evaluation.runner import evaluate
+from manip_il.evaluation.runner import measure
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.progress import Progress
 from manip_il.seeding import stream_seeds
@@ -128,7 +128,7 @@ class Run:
         self._progress.start(f"round {round_}, collect", count)
         with self._clock.timed("collect"):
             if not (here / DATASET).is_dir():
-                job = expert_job(config, round_)
+                job = round_job(config, round_)
                 stream = f"round/{round_}" if round_ else "demonstrations"
                 seeds = stream_seeds(stream, MAX_TRIES * count, config.seed)
                 episodes = collect_successes(
@@ -151,16 +151,14 @@ class Run:
         root, journals = (self.folder / HELD_OUT / name for name in (DATASET, JOURNALS))
         with self._clock.timed("collect"):
             if not root.is_dir():
-                job = replace(expert_job(self.config, 0), cameras=None)
+                job = replace(round_job(self.config, 0), cameras=None)
                 episodes = collect(
                     self._engine, job, stream_seeds("held_out", count, self.config.seed), journals
                 )
                 recording = Recording(provenance=provenance(job))
                 recording.write(journals)
                 recording.make(episodes, root)
-            self._held_out_steps = sum(
-                len(read_journal(path)[1]) for path in list_episodes(journals)
-            )
+            self._held_out_steps = sum(length for length, _ in journal_ends(journals))
         return root
 
     def rollouts(
@@ -184,29 +182,22 @@ class Run:
         self._progress.start(f"round {round_}, collect", count)
         with self._clock.timed("collect"):
             if not (here / DATASET).is_dir():
-                steps = config.steps_of_branch if config.label == "branch" else 1
-                job = replace(
-                    expert_job(config, round_), driver=driver, label=config.label, query=rule
-                )
-                job = replace(
-                    job, branch_steps=steps, patience=config.patience if job.labels_all else None
-                )
-                seeds, first = (
-                    stream_seeds(f"round/{round_}", count, config.seed),
-                    round(disturbed * count),
-                )
+                job = round_job(config, round_, driver=driver, label=config.label, query=rule)
+                if config.label == "branch":
+                    job = replace(job, branch_steps=config.steps_of_branch)
+                if job.labels_all:
+                    job = replace(job, patience=config.patience)
                 hard = replace(job, conditions=(standard_in(job.conditions),))
-                episodes = itertools.chain(
-                    collect(
-                        self._engine, hard, seeds[:first], here / JOURNALS, self._progress.episode
-                    ),
-                    collect(
-                        self._engine, job, seeds[first:], here / JOURNALS, self._progress.episode
-                    ),
+                seeds = stream_seeds(f"round/{round_}", count, config.seed)
+                first = round(disturbed * count)
+                episodes = itertools.chain.from_iterable(
+                    collect(self._engine, one, part, here / JOURNALS, self._progress.episode)
+                    for one, part in ((hard, seeds[:first]), (job, seeds[first:]))
                 )
-                left = self._budget(round_)
                 recording = Recording(
-                    provenance=provenance(job), only_labelled=not job.labels_all, labels=left
+                    provenance=provenance(job),
+                    only_labelled=not job.labels_all,
+                    labels=self._budget(round_),
                 )
                 record_round(here, job, episodes, recording)
             everywhere = config.label == "per_state" and rule.kind in ("every", "safety")
@@ -250,10 +241,8 @@ class Run:
             config.env, driver, config.hold, label="last", conditions=config.conditions
         )
         validation = self._evaluate(job, self._folder(round_) / FILE_NAME, f"DAgger round {round_}")
-        here, so_far = (
-            self._made[round_],
-            [one for one in self._made.values() if one.round <= round_],
-        )
+        here = self._made[round_]
+        so_far = [one for one in self._made.values() if one.round <= round_]
         return Result(
             unit="round",
             number=round_,
@@ -281,7 +270,7 @@ class Run:
                 return EvalResult.read(path)
             suite = job.conditions[0].name if job.conditions else NOMINAL.name
             seeds = stream_seeds("validation", self.config.validation_episodes, self.config.seed)
-            found = evaluate(self._engine, job, seeds, name, self._progress.episode, suite=suite)
+            found = measure(self._engine, job, seeds, name, self._progress, suite=suite)
             found.write(path)
             return found
 

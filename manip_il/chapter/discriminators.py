@@ -33,12 +33,7 @@ Batch = tuple[Tensor, ...]  # states (B, e), actions (B, n), next states (B, e),
 
 
 class Discriminator(nn.Module):
-    """A discriminator, its optimiser and its input scales.
-
-    Attributes:
-        asks_density: Whether the logit depends on the learner's log-density of the action, as in
-            AIRL.
-    """
+    """A discriminator, its optimiser and its input scales."""
 
     mean: Tensor
     scale: Tensor
@@ -56,7 +51,7 @@ class Discriminator(nn.Module):
             gamma: Discount per control step in AIRL's f; None for GAIL's form.
         """
         super().__init__()
-        self.config, self.asks_density = config, gamma is not None
+        self.config = config
         for name, value in (("mean", network.input_mean), ("scale", network.input_scale)):
             self.register_buffer(name, value[: network.inputs].clone())
         self.register_buffer("clamp", torch.tensor(network.clamp))
@@ -75,13 +70,12 @@ class Discriminator(nn.Module):
             return g.squeeze(1)
         return (g + self._gamma * self.h(next_states) - self.h(states) - log_prob).squeeze(1)
 
-    def reward(self, learner: Transitions, log_probs: F32 | None = None) -> F32:
+    def reward(self, learner: Transitions, log_probs: F32) -> F32:
         """Return the reward of every transition, (N,), clipped to +-10.
 
         Args:
             learner: Transitions of the learner.
-            log_probs: The learner's log-density of each action, (N,), if the discriminator
-                `asks_density`.
+            log_probs: The learner's log-density of each action, (N,), which GAIL ignores.
         """
         with torch.no_grad():
             rewards = self.logits(self._encode(learner, log_probs))
@@ -91,7 +85,7 @@ class Discriminator(nn.Module):
         self,
         expert: Transitions,
         learner: Transitions,
-        log_probs: tuple[F32, F32] | None,
+        log_probs: tuple[F32, F32],
         rng: np.random.Generator,
     ) -> dict[str, float]:
         """Take an iteration's gradient steps.
@@ -100,28 +94,21 @@ class Discriminator(nn.Module):
             expert: Transitions of the demonstrations.
             learner: Transitions of the learner's last episodes.
             log_probs: Log-densities, under the learner's policy, of the expert's and of the
-                learner's actions, (N,) each, if the discriminator `asks_density`; else None.
+                learner's actions, (N,) each, which GAIL ignores.
             rng: Draws the batches and the points of the gradient penalty.
 
         Returns:
             The mean `loss`, and the accuracies before the first step, `accuracy_expert` and
             `accuracy_learner`.
         """
-        data = [
-            self._encode(one, log)
-            for one, log in zip((expert, learner), log_probs or (None, None), strict=True)
-        ]
+        data = [self._encode(expert, log_probs[0]), self._encode(learner, log_probs[1])]
         with torch.no_grad():
-            right = [
-                (self.logits(data[0]) > 0).float().mean().item(),
-                (self.logits(data[1]) < 0).float().mean().item(),
-            ]
+            found = {
+                "accuracy_expert": (self.logits(data[0]) > 0).float().mean().item(),
+                "accuracy_learner": (self.logits(data[1]) < 0).float().mean().item(),
+            }
         losses = [self._step(data, rng) for _ in range(self.config.steps)]
-        return {
-            "loss": float(np.mean(losses)),
-            "accuracy_expert": right[0],
-            "accuracy_learner": right[1],
-        }
+        return {"loss": float(np.mean(losses)), **found}
 
     def _step(self, data: Sequence[Batch], rng: np.random.Generator) -> float:
         expert, learner = (_drawn(one, self.config.batch_size, rng) for one in data)
@@ -149,14 +136,11 @@ class Discriminator(nn.Module):
         gradients = torch.cat([one for one in found if one is not None], dim=1)
         return (gradients.norm(dim=1) - 1.0).square().mean()
 
-    def _encode(self, rows: Transitions, log_probs: F32 | None) -> Batch:
-        log_prob = torch.zeros(len(rows)) if log_probs is None else torch.from_numpy(log_probs)
-        actions = (
-            torch.from_numpy(rows.actions)
-            * self.free
-            * (1.0 - torch.from_numpy(rows.states[:, -1:]))
-        )
-        return self._state(rows.states), actions, self._state(rows.next_states), log_prob[:, None]
+    def _encode(self, rows: Transitions, log_probs: F32) -> Batch:
+        live = 1.0 - torch.from_numpy(rows.states[:, -1:])
+        actions = torch.from_numpy(rows.actions) * self.free * live
+        log_prob = torch.from_numpy(log_probs)[:, None]
+        return self._state(rows.states), actions, self._state(rows.next_states), log_prob
 
     def _state(self, states: F32) -> Tensor:
         given = torch.from_numpy(states)

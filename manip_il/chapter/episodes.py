@@ -128,10 +128,10 @@ def read_demonstrations(
         NotFiniteError: If a number is not finite.
         ManipError: If a dataset cannot be read, see `joined_columns`.
     """
-    observed = (STATE, ENVIRONMENT_STATE, ACTION)
-    table = joined_columns(roots, [*observed, EPISODE_INDEX, LABEL_VALID, ACTOR, SUCCESS])
-    for name in observed:
-        require_finite(f"column {name}", table[name])
+    names = [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, LABEL_VALID, ACTOR, SUCCESS]
+    table = joined_columns(roots, names)
+    for name, values in table.items():
+        require_finite(f"column {name}", values)
     labelled = (table[LABEL_VALID].ravel() != 0) & (table[ACTOR].ravel() == Actor.EXPERT)
     solved = table[SUCCESS].ravel() != 0
     bounds = np.flatnonzero(np.diff(table[EPISODE_INDEX].ravel(), prepend=-1, append=-1))

@@ -28,7 +28,6 @@ from manip_il.tasks.carry.grid import (
     LENGTH,
     Demonstration,
     Grid,
-    cheapest_path,
     open_features,
     plan,
     rivals,
@@ -72,9 +71,8 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
     obstacle.
     """
     dataset = Dataset.open(root)
-    spec = dataset.spec
-    places = {name: column for column, name in enumerate(spec.environment_state_names)}
-    if f"{EDGE}.here" not in places:
+    spec, names = dataset.spec, dataset.spec.environment_state_names
+    if f"{EDGE}.here" not in names:
         raise ManipError(
             f"{root} has the task {spec.task}; expected a dataset of manip-il record"
             f" --task.type={CARRY}"
@@ -82,18 +80,13 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
     table = dataset.columns([schema.ENVIRONMENT_STATE, schema.SUCCESS, EPISODE_INDEX])
     scene = scene_of(get_robot(spec.robot).name, CARRY, spec.object)
     index = table[EPISODE_INDEX].ravel()
+    at = [names.index(f"{OBJECT}.{axis}") for axis in "xyz"]
     found = list[Carried]()
-    for episode in np.unique(index).tolist():
-        rows = table[schema.ENVIRONMENT_STATE][index == episode].astype(np.float64)
+    for episode in np.unique(index[table[schema.SUCCESS].ravel() != 0]).tolist():
         on_episode()
-        if not table[schema.SUCCESS][index == episode].any():
-            continue
-        layout = observed_layout(
-            scene, OBJECT, {name: float(rows[0, column]) for name, column in places.items()}
-        )
-        positions = carried_stretch(
-            rows[:, [places[f"{OBJECT}.{axis}"] for axis in "xyz"]], np.array(layout.goal)
-        )
+        rows = table[schema.ENVIRONMENT_STATE][index == episode].astype(np.float64)
+        layout = observed_layout(scene, dict(zip(names, rows[0].tolist(), strict=True)))
+        positions = carried_stretch(rows[:, at], np.array(layout.goal))
         grid = Grid(layout, scene.robot)
         path = grid.snap(positions)
         if len(path) < 2 or path[-1] != grid.goal:
@@ -102,9 +95,7 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
             )
         found.append(Carried(episode, grid, positions, Demonstration(grid.problem, path)))
     if not found:
-        raise ManipError(
-            f"{root}: the object reaches the goal in none of its {len(np.unique(index))} episodes"
-        )
+        raise ManipError(f"{root}: the object reaches the goal in none of its episodes")
     return found
 
 
@@ -126,7 +117,8 @@ class Learnt:
 
     Attributes:
         method: One of `METHODS`.
-        weights: The weights, divided by the weight of length, (K,).
+        weights: The weights, divided by the weight of length, (K,); those that are not identified
+            are 0.
         open: Indices of the weights that are not identified, see `open_features`.
         intervals: The weights' credible intervals, (K, 2), or None.
     """
@@ -150,12 +142,17 @@ def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.G
         The weights, with credible intervals if the method is `bayesian`.
     """
     tastes = rng.exponential(bayesian.PRIOR, (_TASTES, demonstrations[0].problem.features.shape[1]))
-    unknown = tuple(open_features(demonstrations, rivals(demonstrations, tastes)))
+    unknown = open_features(demonstrations, rivals(demonstrations, tastes))
+    intervals = None
     if method == "bayesian":
-        found = bayesian.fit(demonstrations, rng)
-        return Learnt(method, found.mean / found.mean[LENGTH], unknown, found.ratios(LENGTH, LEVEL))
-    weights = (max_margin if method == "max_margin" else max_entropy).fit(demonstrations)
-    return Learnt(method, weights / weights[LENGTH], unknown)
+        draws = bayesian.fit(demonstrations, rng)
+        weights, ratios = draws.mean(axis=0), draws / draws[:, [LENGTH]]
+        intervals = np.quantile(ratios, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0).T
+    else:
+        weights = (max_margin if method == "max_margin" else max_entropy).fit(demonstrations)
+    weights = weights / weights[LENGTH]
+    weights[unknown] = 0.0
+    return Learnt(method, weights, tuple(unknown), intervals)
 
 
 @dataclass(frozen=True)
@@ -178,19 +175,10 @@ class Inverse:
         return tuple(FEATURES[k] for k in self.learnt.open)
 
     @cached_property
-    def weights(self) -> F64:
-        """Weights to plan with, (K,); undetermined ones are 0."""
-        found = self.learnt.weights.copy()
-        found[list(self.learnt.open)] = 0.0
-        return found
-
-    @cached_property
     def replanned(self) -> tuple[tuple[I64, F64], ...]:
         """Cheapest paths from the demonstrations' starts: nodes (n,) and features (K,) of each."""
         shown = [one.demonstration for one in self.carried]
-        return tuple(
-            cheapest_path(one.problem, plan(one.problem, self.weights), one.start) for one in shown
-        )
+        return tuple(plan(one.problem, self.learnt.weights).path(one.start) for one in shown)
 
     @property
     def means(self) -> tuple[F64, F64]:
@@ -204,7 +192,7 @@ class Inverse:
         weights.
         """
         shown, planned = self.means
-        return float(shown @ self.weights / (planned @ self.weights) - 1)
+        return float(shown @ self.learnt.weights / (planned @ self.learnt.weights) - 1)
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of `reward.json`; only `names` and `weights` are needed to load it."""
@@ -212,8 +200,8 @@ class Inverse:
         intervals = self.learnt.intervals
         return {
             "names": [FEATURES[k] for k in known],
-            "weights": [float(self.weights[k]) for k in known],
-            "intervals": None if intervals is None else [intervals[k].tolist() for k in known],
+            "weights": self.learnt.weights[known].tolist(),
+            "intervals": None if intervals is None else intervals[known].tolist(),
             "level": None if intervals is None else LEVEL,
             "not_identified": self.open_names,
             "method": self.learnt.method,
@@ -280,25 +268,18 @@ def _cost_figure(found: Inverse) -> Figure:
     shown = sorted(pairs, key=lambda pair: -len(pair[0].grid.layout.places))[:_PANELS]
     with drawing(len(shown), size=(3.0, 3.1)) as (drawn, axes):
         for axis, (one, (path, _)) in zip(axes[0], shown, strict=True):
-            grid, layout = one.grid, one.grid.layout
-            level = (
-                np.abs(grid.points[:, 2] - np.median(one.positions[:, 2])).argmin() % grid.shape[2]
-            )
-            cost = (
-                (layout.densities(grid.points) @ found.weights).reshape(grid.shape)[:, :, level].T
-            )
-            (left, near, _), (right, far, _) = grid.points[[0, -1]]
-            extent = (left, right, near, far)
-            image = axis.imshow(
-                cost, origin="lower", extent=extent, cmap="Greens", interpolation="bilinear"
-            )
-            for name, place in layout.places:
-                axis.annotate(name, place, ha="center", va="center", fontsize=6.5)
-            axis.plot(*one.positions[:, :2].T, "-", color=DAGGER, lw=1.8, label="demonstrated")
-            axis.plot(*grid.points[path, :2].T, "--", color=CLONING, lw=1.6, label="re-planned")
-            drawn.colorbar(image, ax=axis, location="bottom", shrink=0.8, pad=0.02)
-            axis.set(title=f"episode {one.episode}", xticks=[], yticks=[])
-            axis.grid(visible=False)
+            points = one.grid.points
+            over = points.reshape(*one.grid.shape, 3)[:, :, 0].copy()
+            over[:, :, 2] = np.median(one.positions[:, 2])
+            costs = one.grid.layout.densities(over.reshape(-1, 3)) @ found.learnt.weights
+            costs = costs.reshape(over.shape[:2])
+            image = axis.contourf(over[:, :, 0], over[:, :, 1], costs, 20, cmap="Greens")
+            drawn.colorbar(image, ax=axis, location="bottom", shrink=0.8)
+            for name, place in one.grid.layout.places:
+                axis.text(*place, name, ha="center", va="center")
+            axis.plot(*one.positions[:, :2].T, "-", color=DAGGER, label="demonstrated")
+            axis.plot(*points[path, :2].T, "--", color=CLONING, label="re-planned")
+            axis.set(title=f"episode {one.episode}", xticks=[], yticks=[], aspect="equal")
         drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
         return to_figure(
             drawn, "Cost of a metre of path over the table, with demonstrated and re-planned paths"

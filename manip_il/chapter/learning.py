@@ -12,6 +12,7 @@ resumed from its last finished iteration ends with the same bytes.
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -23,6 +24,7 @@ import numpy as np
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from safetensors.torch import load_file, save_file
 
+from manip_il import checks
 from manip_il.algorithms.results import VALIDATION, Result, Stopwatch, best_validation, validations
 from manip_il.algorithms.run import Run
 from manip_il.chapter.config import LONGER, LearningConfig
@@ -31,7 +33,6 @@ from manip_il.chapter.episodes import (
     ActionRange,
     Lockstep,
     RobotEpisode,
-    Transitions,
     read_demonstrations,
 )
 from manip_il.chapter.ppo import (
@@ -45,18 +46,16 @@ from manip_il.chapter.reward import LearnedReward
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import HOLD, RolloutJob
 from manip_il.data.atomic import CHECKPOINT, kind_of, new_folder
-from manip_il.data.dataset import Dataset
 from manip_il.errors import UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
 from manip_il.learn.network import threads
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
+    STEP_FILE,
     TRAINING_STATE,
     last_checkpoint,
     new_checkpoint,
-    read_step,
-    write_own_files,
 )
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
@@ -67,37 +66,31 @@ _WEIGHTS = "weights.safetensors"
 
 
 def gail(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
-    """Yield each iteration's result: roll out the agent, fit the discriminator, use its reward to
-    improve the agent.
-
-    Generative adversarial imitation learning (Ho & Ermon, NeurIPS 2016, algorithm 1), with PPO as
-    its policy step.
+    """Yield each iteration's result of generative adversarial imitation learning (Ho & Ermon,
+    NeurIPS 2016, algorithm 1), with PPO as its policy step.
     """
-    agent = run.agent()
-    d = agent.discriminator()
-    yield from run.begin(agent)
-    while agent.simulated < c.steps:
-        steps = agent.rollouts()
-        agent.discriminate(d, steps)
-        agent.improve(d.reward(steps))
-        yield run.finish(agent)
+    return _imitate(run, c, None)
 
 
 def airl(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
-    """Yield each iteration's result: roll out the agent, fit f, improve the agent by the reward f -
-    log pi.
+    """Yield each iteration's result of adversarial inverse reinforcement learning (Fu, Luo &
+    Levine, ICLR 2018, algorithm 1), with PPO as its policy step.
 
-    Adversarial inverse reinforcement learning (Fu, Luo & Levine, ICLR 2018, algorithm 1), with PPO
-    as its policy step. The discriminator is D = exp f / (exp f + pi), with the learner's density
-    pi.
+    The discriminator is D = exp f / (exp f + pi), with the learner's density pi.
+    """
+    return _imitate(run, c, c.discount)
+
+
+def _imitate(run: LearningRun, c: LearningConfig, gamma: float | None) -> Iterator[Result]:
+    """Roll out the agent, fit the discriminator, and use its reward to improve the agent, again
+    and again.
     """
     agent = run.agent()
-    d = agent.discriminator(c.discount)
+    d = agent.discriminator(gamma)
     yield from run.begin(agent)
     while agent.simulated < c.steps:
-        steps = agent.rollouts()
-        agent.discriminate(d, steps)
-        agent.improve(d.reward(steps, agent.log_prob(steps)))
+        agent.rollouts()
+        agent.improve(agent.discriminate(d))
         yield run.finish(agent)
 
 
@@ -237,33 +230,25 @@ class Agent:
         self.config, self._clock = config, clock
         self.number = self.simulated = self.validated_at = 0
         self.metrics: dict[str, float] = {}
-        self._spec = spec = (
-            Dataset.open(config.datasets[0]).spec if config.datasets else env_spec(config.env)
-        )
+        self._spec = env_spec(config.env)
         start = None if config.start is None else Checkpoint.open(config.start)
-        self._conversion = start_conversion(start, config.action_space, spec)
-        demonstrations = (
-            read_demonstrations(config.datasets, self._conversion.encode)
-            if config.datasets
-            else None
-        )
+        self._conversion = start_conversion(start, config.action_space, self._spec)
+        encode = self._conversion.encode
+        shown = read_demonstrations(config.datasets, encode) if config.datasets else None
         horizon = config.episode_steps or config.env.horizon
-        if demonstrations and not config.episode_steps:
-            horizon = min(horizon, math.ceil(LONGER * demonstrations.longest))
-        hold = demonstrations.hold if demonstrations else None
+        if shown and not config.episode_steps:
+            horizon = min(horizon, math.ceil(LONGER * shown.longest))
+        hold, rows = (shown.hold, shown.stacked) if shown else (None, None)
         with threads(1):
             seed_generators(self._stream("weights"))
-            rows = demonstrations.stacked if demonstrations else None
-            self._policy = start_policy(start, self._conversion, spec, rows)
+            self._policy = start_policy(start, self._conversion, self._spec, rows)
             actions = ActionRange.of(self._policy.model)
             episodes = [RobotEpisode(config.env, hold) for _ in range(config.episodes)]
             self.envs = Lockstep(episodes, actions, horizon, self._conversion)
             log_std, clone = config.first_log_std, start is not None
             self._learner = Learner(self._policy.model, config.ppo, self.envs, log_std, clone=clone)
         self._modules: dict[str, Any] = {"actor_critic": self._learner.policy}
-        self._expert = (
-            demonstrations.padded(horizon, actions.normalised) if demonstrations else None
-        )
+        self._expert = shown.padded(horizon, actions.normalised) if shown else None
 
     def discriminator(self, gamma: float | None = None) -> Discriminator:
         """Return a discriminator, which is saved with the agent.
@@ -276,23 +261,17 @@ class Agent:
         self._modules["discriminator"] = made
         return made
 
-    def rollouts(self) -> Transitions:
-        """Start an iteration by running its episodes.
-
-        Return all steps, including those in absorbing states.
-        """
-        config = self.config
+    def rollouts(self) -> None:
+        """Start an iteration by running its episodes."""
+        count = self.config.episodes
         self.number += 1
-        seed = stream_seeds("reinforcement", self.number * config.episodes, config.seed)[
-            -config.episodes
-        ]
+        seed = stream_seeds("reinforcement", self.number * count, self.config.seed)[-count]
         with self._clock.timed("collect"), threads(1):
             seed_generators(self._stream("rollouts"))
             self._rows = self._learner.collect(seed)
         self.simulated += self.envs.simulated
         solved, absorbing = self.envs.solved.mean(), self._rows.absorbing.mean()
         self.metrics = {"success": float(solved), "absorbing": float(absorbing)}
-        return self._rows
 
     def executed(self) -> F32:
         """Return joint state, environment state and absolute action of every step of the last
@@ -302,16 +281,9 @@ class Agent:
             [self._rows.states[:, :-1], np.concatenate(self.envs.executed)]
         ).astype(np.float32)
 
-    def log_prob(self, rows: Transitions) -> F32:
-        """Return log-density plus entropy [nats] of each row's action, (N,).
-
-        See `Learner.log_prob`.
-        """
-        with threads(1):
-            return self._learner.log_prob(rows)
-
-    def discriminate(self, d: Discriminator, steps: Transitions) -> None:
-        """Fit a discriminator to the demonstrations and the agent's steps.
+    def discriminate(self, d: Discriminator) -> F32:
+        """Fit a discriminator to the demonstrations and the last rollouts, and return its rewards
+        of these, (N,).
 
         The demonstrated actions get noise with the learner's initial standard deviation. Without
         this noise the discriminator would only detect the learner's exploration noise, and AIRL's
@@ -324,10 +296,11 @@ class Agent:
         rng = rng_for(self._stream("discriminator"), "batches")
         with self._clock.timed("fit"), threads(1):
             expert = self._learner.explored(self._expert, rng)
-            density = self._learner.log_prob
-            log_probs = (density(expert), density(steps)) if d.asks_density else None
-            found = d.fit(expert, steps, log_probs, rng)
+            density, own = self._learner.log_prob(expert), self._learner.log_prob(self._rows)
+            found = d.fit(expert, self._rows, (density, own), rng)
+            rewards = d.reward(self._rows, own)
         self.metrics |= {f"discriminator_{name}": value for name, value in found.items()}
+        return rewards
 
     def improve(self, rewards: F32) -> None:
         """Update the policy by PPO with the rewards (N,) of the last rollouts."""
@@ -348,15 +321,21 @@ class Agent:
             save_policy(self._policy, self._conversion, new / PRETRAINED_MODEL)
             (new / TRAINING_STATE).mkdir()
             save_modules(self._modules, new / TRAINING_STATE)
-            step = {"step": self.number, "simulated": self.simulated, "metrics": self.metrics}
-            write_own_files(new, origin, step | {"validated_at": self.validated_at})
+            step = {
+                "step": self.number,
+                "simulated": self.simulated,
+                "metrics": self.metrics,
+                "validated_at": self.validated_at,
+            }
+            (new / TRAINING_STATE / STEP_FILE).write_text(json.dumps(step))
+            origin.write(new / PRETRAINED_MODEL)
 
     def load(self, folder: Path) -> None:
         """Load a checkpoint to continue from. Raises `ManipError` if it is incomplete."""
-        step = read_step(folder)
+        step = checks.read_json(folder / TRAINING_STATE / STEP_FILE, "the step of a run")
         with in_one_line(f"{folder} cannot be resumed"), threads(1):
-            self.number, self.simulated = int(step["step"]), int(step["simulated"])
-            self.metrics, self.validated_at = dict(step["metrics"]), int(step["validated_at"])
+            self.number, self.simulated = step["step"], step["simulated"]
+            self.metrics, self.validated_at = step["metrics"], step["validated_at"]
             load_modules(self._modules, folder / TRAINING_STATE)
 
     def _options(self) -> dict[str, Any]:

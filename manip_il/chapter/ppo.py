@@ -9,6 +9,7 @@ iterations; they are saved as safetensors and JSON.
 
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,13 @@ from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import MIN_LOG_STD, GaussianHead, floored_log_std
 from manip_il.learn.mlp import MLPConfig, MLPPolicy
 from manip_il.learn.names import EE_DELTA, MLP
-from manip_il.learn.network import MLPNetwork, fit_statistics, perceptron, read_weights
+from manip_il.learn.network import (
+    MLPNetwork,
+    NetworkConfig,
+    fit_statistics,
+    perceptron,
+    read_weights,
+)
 from manip_il.mdp import F32
 from manip_il.worlds.contract import EnvironmentSpec
 
@@ -99,7 +106,7 @@ class ActorCritic(nn.Module):
     def log_prob(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Return log-densities of actions (B, n), and entropies, both (B,) [nats]."""
         gaussian, live = self.gaussian(obs), 1.0 - obs[:, -EXTRA]
-        log_prob, entropy = gaussian.log_prob(actions) * self._free, gaussian.entropy() * self._free
+        log_prob, entropy = gaussian.log_prob(actions) * self.free, gaussian.entropy() * self.free
         return log_prob.sum(1) * live, entropy.sum(1) * live
 
     def values(self, obs: Tensor) -> Tensor:
@@ -123,18 +130,11 @@ class ActorCritic(nn.Module):
     @property
     def log_std(self) -> Tensor:
         """Log-deviations of the action dimensions that vary, (m,), in normalised units."""
-        return floored_log_std(self.head.raw_log_std)[self._free > 0]
+        return floored_log_std(self.head.raw_log_std)[self.free > 0]
 
     @property
-    def spread(self) -> Tensor:
-        """Deviations of the action dimensions, (n,), in normalised units.
-
-        0 for those that never vary.
-        """
-        return floored_log_std(self.head.raw_log_std).exp().detach() * self._free
-
-    @property
-    def _free(self) -> Tensor:
+    def free(self) -> Tensor:
+        """1 for the action dimensions that vary, else 0, (n,)."""
         return (self.actor.target_scale > 0).float()
 
 
@@ -198,7 +198,8 @@ class Learner:
         raw = MIN_LOG_STD + math.log(math.expm1(max(log_std - MIN_LOG_STD, 1e-3)))
         with torch.no_grad():
             self.policy.head.raw_log_std.fill_(raw)
-        self._first_spread = self.policy.spread.numpy().copy()
+            spread = floored_log_std(self.policy.head.raw_log_std).exp() * self.policy.free
+        self._first_spread = spread.numpy()
 
     @torch.no_grad()
     def collect(self, seed: int) -> Transitions:
@@ -331,13 +332,13 @@ def start_policy(
     Raises:
         UsageError: If neither `start` nor `rows` is given.
     """
-    options = (start.mlp_options if start else None) or {}
+    options = asdict(NetworkConfig.of(start.config)) if start else {}
     options |= {
         "loss": _GAUSSIAN,
         "action_space": conversion.space,
         "grippers": conversion.grippers,
     }
-    config = MLPConfig(**{name: value for name, value in options.items() if name != "type"})
+    config = MLPConfig(**options)
     inputs = [STATE, *([ENVIRONMENT_STATE] if spec.environment_state_names else [])]
     config.input_features, config.output_features = policy_features(features(spec), inputs)
     policy = MLPPolicy(config)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, override
@@ -16,6 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from manip_il import checks
+from manip_il.data.atomic import write_json
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.checkpoint import (
     CONFIG,
@@ -80,11 +80,8 @@ def joints_of(spec: EnvironmentSpec) -> tuple[int, ...]:
     """
     if not {"ee.x", "ee.y", "ee.z"} <= set(spec.environment_state_names):
         return ()
-    arm, action = (
-        len(spec.joint_names) - 1,
-        len(spec.joint_names) + len(spec.environment_state_names),
-    )
-    return (*range(arm), *range(action, action + arm))
+    joints, seen = len(spec.joint_names), len(spec.environment_state_names)
+    return tuple(at + joint for at in (0, joints + seen) for joint in range(joints - 1))
 
 
 def shape_for(spec: EnvironmentSpec, members: int) -> RewardShape:
@@ -124,8 +121,7 @@ class RewardNetwork(nn.Module):
         self.ways = [list(way) for way in shape.ways]
         self.read = [column for column in range(inputs) if column not in shape.unread]
         inputs = len(self.read) + len(shape.ways)
-        sizes = [inputs, *[shape.width] * shape.depth, 1]
-        layers = list(itertools.pairwise(sizes))
+        layers = list(itertools.pairwise([inputs, *[shape.width] * shape.depth, 1]))
         self.weights = nn.ParameterList(
             torch.zeros(shape.members, fan_in, out) for fan_in, out in layers
         )
@@ -213,27 +209,25 @@ class LearnedReward:
             raise MismatchError("task", "the reward", self.origin.task, name, spec.task)
         self.origin.check_fits(spec)
 
-    @torch.inference_mode()
     def __call__(self, inputs: F32) -> F32:
         """Return every row's reward, (B,), for rows of state, environment state and absolute
         action, (B, n + k + n).
         """
-        with threads(1):
-            parts = [self.network(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)]
-        return np.concatenate(parts)
+        return self._evaluate(self.network, inputs)
 
-    @torch.inference_mode()
     def members(self, inputs: F32) -> F64:
         """Return every network's reward in log-odds per step, (M, B).
 
         Args:
             inputs: Rows of state, environment state and absolute action, (B, n + k + n).
         """
+        return self._evaluate(self.network.members, inputs).astype(np.float64)
+
+    @torch.inference_mode()
+    def _evaluate(self, reward: Callable[[Tensor], Tensor], inputs: F32) -> F32:
         with threads(1):
-            parts = [
-                self.network.members(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)
-            ]
-        return np.concatenate(parts, axis=1).astype(np.float64)
+            parts = [reward(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)]
+        return np.concatenate(parts, axis=-1)
 
 
 def write_reward(
@@ -258,9 +252,8 @@ def write_reward(
         OSError: If a file cannot be written.
     """
     origin = Origin.of(spec, fingerprint, options)
-    config = {"type": PREFERENCE, **asdict(network.shape)}
-    for name, values in ((CONFIG, config), (META_FILE, origin.to_json())):
-        (folder / name).write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / CONFIG, {"type": PREFERENCE, **asdict(network.shape)})
+    origin.write(folder)
     save_file(
         {f"model.{name}": tensor for name, tensor in network.state_dict().items()}, folder / WEIGHTS
     )

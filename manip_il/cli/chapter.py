@@ -21,12 +21,8 @@ from manip_il.option import Seeded, option
 class OfPairs:
     """Options of a command on pairs of clips."""
 
-    pairs: Path = option(
-        MISSING, "pairs.json from manip-il reward pairs", positional=True, exists=""
-    )
-    sources: list[Path] = option(
-        MISSING, "the datasets or runs from which the pairs were chosen", exists="datasets/"
-    )
+    pairs: Path = option(MISSING, "pairs.json from manip-il reward pairs", positional=True)
+    sources: list[Path] = option(MISSING, "the datasets or runs from which the pairs were chosen")
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,7 @@ class PairsOptions(Seeded, OutputFile):
     clip: int = option(20, "length of a clip [control steps]", at_least=1)
     count: int = option(200, "number of pairs", at_least=1)
     reward: Path | None = option(
-        None, "a fitted reward, for pairs on which its networks disagree most", exists=""
+        None, "a fitted reward, for pairs on which its networks disagree most"
     )
     output: Path = output_file("pairs.json")
 
@@ -94,12 +90,8 @@ class FitOptions(OfPairs, Seeded, Output):
     --output_dir=runs/reward
     """
 
-    answers: list[Path] = option(
-        MISSING, "preferences.json from ask or answer", positional=True, exists=""
-    )
-    more_pairs: list[Path] = option(
-        list, "further pairs.json of the same task and clip length", exists=""
-    )
+    answers: list[Path] = option(MISSING, "preferences.json from ask or answer", positional=True)
+    more_pairs: list[Path] = option(list, "further pairs.json of the same task and clip length")
     members: int = option(
         8, "number of networks in the ensemble, and of folds of the pairs", at_least=3, at_most=64
     )
@@ -133,7 +125,7 @@ class TheoryOptions(EngineOptions, Output):
     """
 
     source: Path | None = option(
-        None, "a run of manip-il dagger, to measure its rounds", positional=True, exists=""
+        None, "a run of manip-il dagger, to measure its rounds", positional=True
     )
     episodes: int = option(50, "episodes of the expert and of every round's policy", at_least=2)
     cases: int = option(
@@ -200,6 +192,6 @@ class PpoOptions(Learning):
     """
 
     method: ClassVar[str] = "ppo"
-    init: Path = option(MISSING, "the cloned mlp (a checkpoint or a run) to improve", exists="")
-    reward: Path = option(MISSING, "the reward: a folder from manip-il reward fit", exists="")
+    init: Path = option(MISSING, "the cloned mlp (a checkpoint or a run) to improve")
+    reward: Path = option(MISSING, "the reward: a folder from manip-il reward fit")
     output_dir: Path = output_folder("runs/ppo")

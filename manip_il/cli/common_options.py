@@ -39,14 +39,14 @@ def default_cameras(env: EnvConfig) -> tuple[str, ...]:
 class DatasetRoots:
     """`--dataset.*`: the training data."""
 
-    root: list[Path] = option(MISSING, DATASET, exists="datasets/", free=True)
+    root: list[Path] = option(MISSING, DATASET, free=True)
 
 
 @dataclass(frozen=True)
 class OfDataset:
     """Options of a command on one dataset."""
 
-    dataset: Path = option(MISSING, DATASET, exists="datasets/", positional=True)
+    dataset: Path = option(MISSING, DATASET, positional=True)
 
 
 def worker_count(default: int | None = None) -> Any:

@@ -29,7 +29,7 @@ class BuildOptions(Replacing):
     Example: manip-il data build datasets/demos.journals datasets/demos
     """
 
-    journals: Path = option(MISSING, "folder of episode-*.mcap files", positional=True, exists="")
+    journals: Path = option(MISSING, "folder of episode-*.mcap files", positional=True)
     dataset: Path = option(MISSING, "folder of the new dataset", positional=True)
 
 
@@ -61,9 +61,7 @@ class MergeOptions(Replacing):
     Example: manip-il data merge datasets/demos datasets/more --output=datasets/both
     """
 
-    datasets: list[Path] = option(
-        MISSING, "LeRobot v3.0 datasets", exists="datasets/", positional=True
-    )
+    datasets: list[Path] = option(MISSING, "LeRobot v3.0 datasets", positional=True)
     output: Path = option(MISSING, "folder of the new dataset")
     episodes: list[str] = option(
         list,
@@ -82,9 +80,7 @@ class MergeOptions(Replacing):
 class Edit(Replacing):
     """Options for editing a dataset's states."""
 
-    source: Path = option(
-        MISSING, "a manip-il dataset; for redraw, also a run", positional=True, exists="datasets/"
-    )
+    source: Path = option(MISSING, "a manip-il dataset; for redraw, also a run", positional=True)
     target: Path | None = option(
         None,
         "folder of the new dataset; by default SOURCE_rendered, _relabelled or _redrawn",
@@ -174,9 +170,7 @@ class CheckOptions(OfDataset):
 
 @dataclass(frozen=True)
 class RepairOptions(CheckOptions):
-    """Rebuild a dataset from its journals.
-
-    Without them recompute counts and statistics, and move leftover files away.
+    """Compute a dataset's counts and statistics again if they are wrong.
 
     Replaced files are kept in DATASET.before-repair. Then the dataset is checked again.
 

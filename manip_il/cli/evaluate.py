@@ -74,7 +74,7 @@ class EvalOptions(Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
         " resume"
     )
     evaluation: list[Path] = option(
-        list, "evaluations: one with --replay, or several to merge", positional=True, exists=""
+        list, "evaluations: one with --replay, or several to merge", positional=True
     )
     policy: MeasuredPolicyGroup = field(default_factory=MeasuredPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
@@ -159,7 +159,6 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting, EngineOptions,
         MISSING,
         "two sides, each an eval.json, a policy or a run; or the YAML file of a study",
         positional=True,
-        exists="",
         free=True,
     )
     env: Given = given(EnvConfig, **OF_POLICY)

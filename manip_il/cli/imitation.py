@@ -7,7 +7,6 @@
 `manip-il demo`: demonstrations, cloning, DAgger, and a report that compares them.
 """
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -17,7 +16,6 @@ from manip_il.cli.common_options import SMALL, DatasetRoots, EngineOptions, Trus
 from manip_il.cli.outputs import Resumable, ResumableOutput, output_folder
 from manip_il.cli.parsing import Given, given
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import Seeded, option
 from manip_il.sim.config import CameraConfig
@@ -33,12 +31,6 @@ class SourceGroup(DatasetRoots):
     weights: list[float] = option(
         list, "share of the samples from each dataset; by default its share of frames"
     )
-
-    def __post_init__(self) -> None:
-        wrong = not all(0 < weight < math.inf for weight in self.weights)
-        if self.weights and (wrong or len(self.weights) != len(self.root)):
-            found = f"{self.weights} for {len(self.root)} datasets"
-            raise UsageError(f"--dataset.weights is {found}; expected a number above 0 for each")
 
 
 @dataclass(frozen=True)
@@ -60,7 +52,6 @@ class TrainOptions(Seeded, Trusting, ResumableOutput):
     weights: Path | None = option(
         None,
         "rabc.parquet from manip-il data score: sampling weights of frames, as in LeRobot's RA-BC",
-        exists="",
     )
     fit: Given = given(FitConfig, prefix="")
     output_dir: Path = output_folder("runs/train")

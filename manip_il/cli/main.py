@@ -8,7 +8,6 @@ import importlib
 import inspect
 import logging
 import os
-import re
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -18,16 +17,16 @@ from typing import Any
 from manip_il import __version__
 from manip_il.bridges.store.errors import redact
 from manip_il.cli import progress
-from manip_il.cli.parsing import Option, check_paths, metavar, options_of, parse, word
+from manip_il.cli.parsing import Option, metavar, options_of, parse, word
 from manip_il.errors import ManipError, UnknownName, printable, silence_ffmpeg_warning, told
 
 PROGRAM = "manip-il"
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 
 
-# name -> `module:OptionsClass` in `manip_il.cli`, and a summary. The function is in the module of
-# `manip_il.cli.run` with the same name or, so that it imports only what it needs, in the one that a
-# third part names.
+# name -> `module:OptionsClass` in `manip_il.cli`, and a summary. The function `run_` and the last
+# word of the name is in the module of `manip_il.cli.run` with the same name or, so that it imports
+# only what it needs, in the one that a third part names.
 COMMANDS = {
     "demo": (
         "imitation:DemoOptions",
@@ -50,11 +49,11 @@ COMMANDS = {
     "pull": ("transfer:PullOptions", "download a dataset or policy and verify every file"),
     "export": ("transfer:ExportOptions:export", "export a policy as ONNX"),
     "theory": (
-        "chapter:TheoryOptions:theory",
+        "chapter:TheoryOptions",
         "compare the proven bounds of cloning and DAgger with a run",
     ),
     "data check": ("data:CheckOptions", "find errors in any LeRobot dataset"),
-    "data repair": ("data:RepairOptions", "repair a dataset, from its journals or its own data"),
+    "data repair": ("data:RepairOptions", "compute wrong counts and statistics of a dataset again"),
     "data render": (
         "data:RenderOptions",
         "render a dataset again, with other cameras, sizes or lights",
@@ -82,7 +81,7 @@ COMMANDS = {
     "robot check": ("robots:RobotCheckOptions", "measure what an arm can do, before recording"),
     "robot certify": ("robots:CertifyOptions", "measure from which states the expert recovers"),
     "env check": (
-        "robots:EnvCheckOptions:robots",
+        "robots:EnvCheckOptions:env",
         "does a world of your own keep the contract, and how good is its expert",
     ),
     "rl gail": (
@@ -146,10 +145,9 @@ def load(name: str) -> type:
 
 def run(name: str, options: Any) -> None:
     """Run a command with its options."""
-    module, options_class, *other = COMMANDS[name][0].split(":")
+    module, _, *other = COMMANDS[name][0].split(":")
     work = importlib.import_module(f"manip_il.cli.run.{[*other, module][0]}")
-    command = re.sub(r"\B(?=[A-Z])", "_", options_class.removesuffix("Options")).lower()
-    getattr(work, f"run_{command}")(options)
+    getattr(work, f"run_{name.split()[-1].replace('-', '_')}")(options)
 
 
 def _dispatch(own: list[str], others: list[str]) -> None:
@@ -165,7 +163,6 @@ def _dispatch(own: list[str], others: list[str]) -> None:
         print(_command_help(name, load(name), words))
     else:
         options = parse(load(name), [*words, *others], command=name)
-        check_paths(options)
         silence_ffmpeg_warning()
         run(name, options)
 

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from manip_il.evaluation.report import Report
     from manip_il.evaluation.tables import Table
 
-REPORT_FILE = "report.html"
-
 
 @dataclass(frozen=True, kw_only=True)
 class Replacing:
@@ -63,27 +61,22 @@ class Output(Replacing):
     output_dir: Path = output_folder()
 
     @contextmanager
-    def open(self, *sources: Path, saved: Any = None) -> Generator[Path]:
-        """Lock and prepare the folder, and write the options to `config.yaml`.
+    def open(self, saved: Any = None) -> Generator[Path]:
+        """Lock and prepare the folder, and write the options, or `saved`, to `config.yaml`.
 
         A resumed run must have the same options. Raises what `prepare_output` and
         `check_same_options` raise.
-
-        Args:
-            sources: Further inputs, which must not be replaced.
-            saved: Options to write in place of the command's.
         """
-        with self.lock(*sources, saved=saved) as prepare:
+        with self.lock(saved) as prepare:
             prepare()
             yield self.output_dir
 
-    def lock(self, *sources: Path, saved: Any = None) -> Any:
+    def lock(self, saved: Any = None) -> Any:
         """Return a context manager like `open`, in which a function that it yields prepares the
         folder.
         """
-        options = saved or self
-        kinds = {self.output_dir: output_of(type(options).__name__)}
-        return locked(kinds, self, options, [*_inputs(options), *sources])
+        kind = output_of(type(saved or self).__name__)
+        return locked({self.output_dir: kind}, self, saved or self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,16 +107,13 @@ class OutputFile(Replacing):
 
 
 @contextmanager
-def locked(
-    kinds: Mapping[Path, str], how: Replacing, options: Any, sources: Iterable[Path] = ()
-) -> Generator[Callable[[], None]]:
+def locked(kinds: Mapping[Path, str], how: Replacing, saved: Any) -> Generator[Callable[[], None]]:
     """Lock the first of a command's output folders; yield a function that prepares all of them.
 
     Args:
         kinds: Folder -> its kind, as `kind_of` names it. The options are written to the last.
-        how: Whether to replace what is there, or to continue it.
-        options: The command's options.
-        sources: Input paths, which must not be replaced.
+        how: The command's options; they say whether to replace what is there, or to continue it.
+        saved: The options to write.
     """
     first, *_ = kinds
     *_, home = kinds
@@ -131,9 +121,10 @@ def locked(
     def prepare() -> None:
         resume = getattr(how, "resume", False)
         if resume:  # before anything is deleted
-            check_same_options(home, options)
-        prepare_output(kinds, resume=resume, overwrite=how.overwrite, sources=sources)
-        save_options(home, options)
+            check_same_options(home, saved)
+        read = {*_inputs(to_plain(how)), *_inputs(to_plain(saved))} - kinds.keys()
+        prepare_output(kinds, resume=resume, overwrite=how.overwrite, sources=read)
+        save_options(home, saved)
 
     new = [parent for parent in first.parents if not parent.exists()]
     try:
@@ -145,20 +136,14 @@ def locked(
                 parent.rmdir()  # if nothing was written
 
 
-def _inputs(options: Any) -> Iterator[Path]:
-    """Yield the paths in a command's options that exist, except its output folder."""
-    waiting: list[Any] = [
-        {name: value for name, value in to_plain(options).items() if name != "output_dir"}
-    ]
-    while waiting:
-        value = waiting.pop()
-        if isinstance(value, dict | list):
-            waiting += value.values() if isinstance(value, dict) else value
-        elif isinstance(value, str):
-            words = (value, *value.split(":"))  # also `mesh:FILE:LENGTH` and `carry:FILE`
-            yield from (
-                path for word in words if word and (path := Path(word).expanduser()).exists()
-            )
+def _inputs(tree: Any) -> Iterator[Path]:
+    """Yield the paths in a tree of options that exist."""
+    if isinstance(tree, dict | list):
+        for value in tree.values() if isinstance(tree, dict) else tree:
+            yield from _inputs(value)
+    elif isinstance(tree, str):
+        words = (tree, *tree.split(":"))  # also `mesh:FILE:LENGTH` and `carry:FILE`
+        yield from (path for word in words if word and (path := Path(word).expanduser()).exists())
 
 
 def prepare_output(
@@ -172,17 +157,13 @@ def prepare_output(
 
     Args:
         kinds: Folder -> the kind of folder that may be replaced, as `kind_of` names it.
-        resume: Whether to continue with what is there.
+        resume: Whether to continue with what is there; then nothing of it is deleted.
         overwrite: Whether to delete what is there.
         sources: Input paths, which must not be replaced.
 
     Raises:
-        UsageError: what `require_writable` raises, and for options that contradict each other.
+        UsageError: what `require_writable` raises.
     """
-    if resume and overwrite:
-        raise UsageError(
-            "--resume=true and --overwrite=true contradict each other; give one of them"
-        )
     for folder, kind in () if resume else kinds.items():  # all of them, before one is emptied
         require_writable(folder, kind, overwrite, sources)
     for folder in kinds:
@@ -242,8 +223,7 @@ def publish(
     written = [f"result: {path}"]
     write_json(path, content)
     if page is not None:
-        replace(page, **about(options)).write(path.with_name(REPORT_FILE))
-        written.append(f"report: {path.with_name(REPORT_FILE)}")
+        written.append(f"report: {replace(page, **about(options)).write(path.parent)}")
     for table in tables:
         table.print()
     say(*lines, *written)

@@ -33,7 +33,6 @@ from manip_il import __version__
 from manip_il.checks import parse_yaml, read_yaml, shorten
 from manip_il.data.atomic import CONFIG_HEADER
 from manip_il.errors import ManipError, UsageError, nearest
-from manip_il.learn.checkpoint import hub_hint
 from manip_il.option import NameOrPath, check_bound, type_of, typed
 
 Open = dict[str, Any]  # option -> value as read by YAML
@@ -81,11 +80,9 @@ class Option:
         type: The type of its value.
         default: Its default; `MISSING` if the user must give a value.
         metadata: `help`, one line; `positional` for a value without a name; `command_line_only` for
-            an option that no file may set; `exists` for a path that must exist, with its prefix on
-            the Hub (`datasets/`); `flag`, the full name; `alias`, another one; `at_least` and
-            `at_most`; `free` and `grows` for an option that a resumed run may change (see
-            `check_same_options`).
-        is_given: Whether it is an option of another class, see `given`.
+            an option that no file may set; `flag`, the full name; `alias`, another one;
+            `at_least` and `at_most`; `free` and `grows` for an option that a resumed run may change
+            (see `check_same_options`).
     """
 
     name: str  # dotted: `dataset.root`
@@ -93,7 +90,6 @@ class Option:
     type: Any
     default: Any
     metadata: Mapping[str, Any]
-    is_given: bool = False
 
     @property
     def positional(self) -> bool:
@@ -152,16 +148,8 @@ def options_of(
                     own, about = default.get(theirs.name, default_of(theirs)), dict(theirs.metadata)
                     if theirs.name in one.metadata["fixed"]:
                         about["grows"] = False
-                    found.append(
-                        Option(
-                            name,
-                            (*here, theirs.name),
-                            type_of(source, theirs),
-                            own,
-                            about,
-                            is_given=True,
-                        )
-                    )
+                    kind = type_of(source, theirs)
+                    found.append(Option(name, (*here, theirs.name), kind, own, about))
         elif dataclasses.is_dataclass(kind):
             found += options_of(
                 typing.cast(type, kind), None if default is MISSING else default, inner, here
@@ -191,10 +179,14 @@ def to_plain(options: Any) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for one in options_of(type(options)):
         if not one.metadata.get("command_line_only") and one.name not in ("overwrite", "resume"):
-            *groups, last = one.name.split(".")
-            place = functools.reduce(lambda inner, name: inner.setdefault(name, {}), groups, tree)
-            place[last] = _plain(one.value(options))
+            _put(tree, one.name.split("."), _plain(one.value(options)))
     return tree
+
+
+def _put(tree: dict[str, Any], path: Sequence[str], value: Any) -> None:
+    """Set a value in a tree, creating the groups on its path."""
+    *groups, last = path
+    functools.reduce(lambda inner, name: inner.setdefault(name, {}), groups, tree)[last] = value
 
 
 def _plain(value: Any) -> Any:
@@ -230,36 +222,26 @@ def metavar(option_type: Any) -> str:
     return _METAVARS.get(option_type, "VALUE")
 
 
-def from_word(option_type: Any, word: str) -> Any:
-    """Return the value of a command-line word: None for `null`, texts for a list type, else the
-    word itself.
-    """
-    some = without_none(option_type)
-    if some != option_type and word in ("null", "none"):
-        return None
-    if typing.get_origin(some) is not list:
-        return word
-    inner = word.removeprefix("[").removesuffix("]")
-    return [item.strip(" '\"") for item in inner.split(",")] if inner else []
-
-
 def decode(option_type: Any, value: Any) -> Any:
     """Convert `value`, from YAML or text, to the declared type.
 
     Raises one of several errors if it is invalid.
 
-    Unlike draccus, refuses a boolean as a number or text, NaN as a number, and "" as a path (the
-    current folder).
+    Unlike draccus, takes `a,b` for a list and `none` for None, and refuses a boolean as a number or
+    text, NaN as a number, and "" as a path (the current folder).
     """
     import draccus  # imported here because help does not need it
 
     some = without_none(option_type)
+    if some != option_type and value in ("null", "none"):
+        return None
     if option_type is Any:
         return parse_yaml(value)
     if hasattr(some, "parse") and isinstance(value, str):
         return some.parse(value)
-    if some == list[Path] and isinstance(value, str):
-        value = [value]
+    if typing.get_origin(some) is list and isinstance(value, str):
+        inner = value.removeprefix("[").removesuffix("]")
+        value = [item.strip(" '\"") for item in inner.split(",")] if inner else []
     if some == NameOrPath:
         return typed(_expand(draccus.decode(str, value)))
     decoded: Any = draccus.decode(option_type, value)
@@ -346,38 +328,24 @@ def from_layers[T](
     raw = dict[str, _Value]()
     for origin, tree in layers:
         raw |= _read_tree(tree, known, origin)
-    values = {option.path: option.default for option in known.values() if not option.is_given}
+    changes = dict[str, Any]()
     for name, one in (raw | dict(words or {})).items():
         option = one.option
-        if option.is_open:
-            values[option.path] = values.get(option.path, {}) | {
-                name.removeprefix(f"{option.name}."): _decode(one)
-            }
         # other nulls mean the default
-        elif one.value is not None or without_none(option.type) != option.type:
-            values[option.path] = _decode(one)
+        if option.is_open or one.value is not None or without_none(option.type) != option.type:
+            own = (name.removeprefix(f"{option.name}."),) if option.is_open else ()
+            _put(changes, option.path + own, _decode(one))
+            known.pop(name, None)
     for option in known.values():
-        if option.default is MISSING and values.get(option.path, MISSING) is MISSING:
+        if option.default is MISSING:
             raise UsageError(f"{option.label} is missing; expected {metavar(option.type)}")
-    return _build(cls, values)
+    return _build(cls, changes)
 
 
 def _named(options: Sequence[Option]) -> dict[str, Option]:
     """Return options by their names, and by their aliases."""
     aliases = {one.metadata["alias"]: one for one in options if "alias" in one.metadata}
     return aliases | {one.name: one for one in options}
-
-
-def check_paths(options: Any) -> None:
-    """Raise `UsageError` if a path to read does not exist."""
-    for one in options_of(type(options)):
-        value = one.value(options) if "exists" in one.metadata else None
-        for path in value if isinstance(value, list) else [value]:
-            if path is not None and not path.exists():
-                raise UsageError(
-                    f"{path} does not exist; expected"
-                    f" {one.metadata['help']}{hub_hint(path, one.metadata['exists'])}"
-                )
 
 
 def dump_yaml(options: Any) -> str:
@@ -392,24 +360,28 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _
     """Return each option's value as given on the command line."""
     raw: dict[str, _Value] = {}
     places = [option for option in known.values() if option.positional]
-    for number, word in enumerate(words):
+    rest = [*words]
+    while rest:
+        word = rest.pop(0)
         name, equals, value = word[2:].partition("=")
         # the rest is another program's command line
         if word == "--" and places and places[-1].is_list:
-            raw[places[-1].name] = _Value(places[-1], list(words[number + 1 :]), places[-1].label)
+            raw[places[-1].name] = _Value(places[-1], rest, places[-1].label)
             break
         if word.startswith("--"):
-            if _find(ours := name.replace("-", "_"), known):  # accept --output-dir
-                name = ours
             option = _find(name, known)
             if option is None or option.positional:
-                raise _unknown_option("option", name, known, "--", command)
+                raise _unknown_option("option", f"--{name}", known, command)
             kind = Any if option.is_open else option.type
-            if not equals and kind is not bool:
+            if not equals and kind is bool:
+                value = rest.pop(0) if rest and rest[0] in ("true", "false") else "true"
+            elif not equals and rest and not rest[0].startswith("--"):
+                value = rest.pop(0)
+            elif not equals:
                 raise UsageError(
                     f"--{name} has no value; write --{name}=VALUE, expected {metavar(kind)}"
                 )
-            raw[name] = _Value(option, from_word(kind, value if equals else "true"), f"--{name}")
+            raw[name] = _Value(option, value, f"--{name}")
         elif not places or word.startswith("-"):
             wanted = f"write options as --name=value; manip-il {command} --help=all lists them"
             raise UsageError(f"unexpected {shorten(word)}; {wanted}")
@@ -446,23 +418,23 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
         elif any(other == name or other.startswith(f"{name}.") for other in known):
             raw |= _read_tree(value, known, origin, f"{name}.")
         else:
-            raise _unknown_option(f"key in {origin}:", name, known, "", "COMMAND")
+            raise _unknown_option(f"key in {origin}:", name, known, "COMMAND")
     return raw
 
 
-def _build(cls: Any, values: Mapping[tuple[str, ...], Any], path: tuple[str, ...] = ()) -> Any:
-    """Return an instance of `cls`. values: of its options, by path."""
-    arguments: dict[str, Any] = {}
-    for declared in dataclasses.fields(cls):
-        here, kind = (*path, declared.name), type_of(cls, declared)
-        if "given" in declared.metadata:
-            raw = {inner[-1]: value for inner, value in values.items() if inner[:-1] == here}
-            arguments[declared.name] = default_of(declared) | raw
+def _build(cls: Any, changes: Mapping[str, Any], base: Any = None) -> Any:
+    """Return an instance of `cls`, of which `changes` holds the fields that differ from `base`."""
+    values = dict[str, Any]()
+    for one in dataclasses.fields(cls):
+        kind, default = type_of(cls, one), default_of(one, base)
+        if "given" in one.metadata:
+            values[one.name] = default | changes.get(one.name, {})
+        elif dataclasses.is_dataclass(kind):
+            base_of_group = None if default is MISSING else default
+            values[one.name] = _build(kind, changes.get(one.name, {}), base_of_group)
         else:
-            arguments[declared.name] = (
-                _build(kind, values, here) if dataclasses.is_dataclass(kind) else values[here]
-            )
-    return cls(**arguments)
+            values[one.name] = changes.get(one.name, default)
+    return cls(**values)
 
 
 def _decode(one: _Value) -> Any:
@@ -481,15 +453,16 @@ def _decode(one: _Value) -> Any:
     return value
 
 
-def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: str) -> UsageError:
+def _unknown_option(kind: str, name: str, known: Known, command: str) -> UsageError:
     """Return the error for an unknown option or key, with the nearest names and the command that
     lists all.
 
-    `num_episodes` finds `dataset.num_episodes`. kind: `option`, or `key in FILE:`. dashes: prefix
-    of the names.
+    `num_episodes` finds `dataset.num_episodes`. kind: `option`, or `key in FILE:`.
     """
-    named = [one.label.replace("--", dashes) for one in known.values() if not one.positional]
-    near = nearest(dashes + name, named, _MOST_OFFERED)
+    labels = [one.label for one in known.values() if not one.positional]
+    if not name.startswith("--"):
+        labels = [label.replace("--", "") for label in labels]
+    near = nearest(name, labels, _MOST_OFFERED)
     return UsageError(
-        f"unknown {kind} {shorten(dashes + name)}{near}; manip-il {command} --help=all lists all"
+        f"unknown {kind} {shorten(name)}{near}; manip-il {command} --help=all lists all"
     )

@@ -90,14 +90,14 @@ class RobotNewOptions(Replacing):
     Example: manip-il robot new my_arm.xml --output=my_arm.yaml
     """
 
-    model: Path = option(MISSING, "the arm's MJCF", positional=True, exists="")
-    gripper: Path | None = option(None, "the gripper's MJCF, if it is a separate file", exists="")
+    model: Path = option(MISSING, "the arm's MJCF", positional=True)
+    gripper: Path | None = option(None, "the gripper's MJCF, if it is a separate file")
     output: Path | None = option(None, "the YAML file; by default next to the model, with its name")
 
 
 @dataclass(frozen=True)
 class RobotCheckOptions(Output):
-    """Measure what an arm can do, before recording; writes check.html and check.json.
+    """Measure what an arm can do, before recording; writes report.html and check.json.
 
     Shows the arm with its hand frame and cameras, its reach, the expert's success at every task
     (also with a tenth of its actions random), and what to change if something does not work. The

@@ -20,7 +20,7 @@ class PushOptions:
     Example: manip-il push datasets/demos hf://datasets/me/demos
     """
 
-    source: Path = option(MISSING, "a dataset, a run or a policy", positional=True, exists="")
+    source: Path = option(MISSING, "a dataset, a run or a policy", positional=True)
     remote: str = option(
         MISSING,
         "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER,"
@@ -63,9 +63,7 @@ class ExportOptions(OutputFile):
     Example: manip-il export runs/dagger --output=policy.onnx
     """
 
-    policy: Path = option(
-        MISSING, "a run, a checkpoint or its pretrained_model", positional=True, exists=""
-    )
+    policy: Path = option(MISSING, "a run, a checkpoint or its pretrained_model", positional=True)
     output: Path = output_file("policy.onnx")
 
 
@@ -93,8 +91,8 @@ class McapImportOptions:
     Example: manip-il data from-mcap demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml
     """
 
-    source: Path = option(MISSING, "an MCAP file, or a folder of them", positional=True, exists="")
+    source: Path = option(MISSING, "an MCAP file, or a folder of them", positional=True)
     dataset: Path = option(MISSING, "folder of the new dataset", positional=True)
     mapping: Path = option(
-        MISSING, "YAML file: the topic of every column (see configs/mcap/panda.yaml)", exists=""
+        MISSING, "YAML file: the topic of every column (see configs/mcap/panda.yaml)"
     )

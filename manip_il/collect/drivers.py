@@ -47,11 +47,15 @@ class Driver:
         kind: The driver's name in datasets, unless it mixes policy and expert.
         beta: Share of the steps that the expert drives.
         policies: Checkpoints of the driver's policies, the first of which drives.
+        trust: Whether to load models and code that the checkpoints name.
+        device: Torch device of the policies.
     """
 
     kind: ClassVar[str]
     beta: float = 0.0
     policies: tuple[Checkpoint, ...] = ()
+    trust: bool = False
+    device: str = "cpu"
 
     @property
     def name(self) -> str:
@@ -123,8 +127,6 @@ class PolicyDriver(Driver):
     Attributes:
         policies: The first one drives; a query rule may compare the others with it.
         beta: Probability at each step that the expert's action is executed.
-        trust: Whether to load models and code that the checkpoints name.
-        device: Torch device of the policies.
     """
 
     kind = "policy"

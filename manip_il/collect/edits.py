@@ -31,14 +31,13 @@ from manip_il.data.info import Info
 from manip_il.data.lerobot_layout import OURS, Features
 from manip_il.data.lerobot_write import write_dataset, write_episodes
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError
-from manip_il.mdp import F64, Actor, Episode, Label, State, Transition
+from manip_il.mdp import F64, Actor, Episode, Label, Observation, State, Transition
 from manip_il.option import NameOrPath
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import (
-    described_env,
     env_fingerprint,
     env_spec,
     make_env,
@@ -169,10 +168,9 @@ class SceneDrawer:
 
 Columns = dict[str, NDArray[Any]]
 _COMPARED = ("model_sha256", "mujoco")  # entries of a fingerprint that affect restored states
+_LABELS = (schema.ACTION, schema.LABEL_VALID, schema.EXPERT_PHASE)
 SERVED = "lerobot"  # `driver` of datasets recorded by LeRobot's programs from our servos
-# smallest change of a label that counts, relative to a joint's longest step or the gripper's
-# opening
-NOTICEABLE = 0.01
+_NOTICEABLE = 1e-3  # smallest change of a label that counts [unit of the action]
 
 
 @dataclass(frozen=True)
@@ -277,7 +275,7 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
         target: The new dataset's folder, and how it is written.
 
     Returns:
-        The number of frames whose label changed: its action by more than `NOTICEABLE`, its phase,
+        The number of frames whose label changed: its action by more than `_NOTICEABLE`, its phase,
         or its validity.
 
     Raises:
@@ -285,15 +283,16 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
             `Dataset.stored_episodes` and `write_episodes` raise.
     """
     source.check_has_no_sag("data relabel")
-    scale, dataset = described_env(source.env).actions.scale, source.dataset
+    dataset = source.dataset
     simulated = {
         key: value for key, value in dataset.fingerprint.items() if key.endswith("_sha256")
     }
     fingerprint = {**env_fingerprint(source.env), **simulated}
     own = Own(dataset.spec, fingerprint, {**dataset.provenance, "relabelled": _origin(source)})
     _rewrite(source, target, partial(label_states, source.env), own, dataset.stored_features)
-    names = (schema.ACTION, schema.LABEL_VALID, schema.EXPERT_PHASE)
-    return _count_changed(dataset.columns(names), Dataset.open(target.root).columns(names), scale)
+    before, after = (one.columns(_LABELS) for one in (dataset, Dataset.open(target.root)))
+    gaps = [np.abs(before[key] - after[key]).reshape(len(dataset), -1) for key in _LABELS]
+    return int((np.hstack(gaps) > _NOTICEABLE).any(axis=1).sum())
 
 
 def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget) -> Info:
@@ -470,28 +469,17 @@ def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -
     """
     view = make_env(env, cameras)
     spec = env_spec(env, cameras)
-    rows = len(states)
-    found: Columns = {key: np.empty((rows, *cameras.size, 3), np.uint8) for key in spec.image_keys}
-    found |= {
-        key: np.empty((rows, 3 * len(spec.keypoints)), np.float32) for key in spec.keypoint_keys
-    }
-    for row, state in enumerate(states):
+    seen: list[Observation] = []
+    for state in states:
         view.set_state(State.from_vector(state))
-        seen = view.observe()
-        for name in cameras.names:
-            found[schema.IMAGES + name][row] = seen.images[name]
-        for key, name in spec.keypoint_keys.items():
-            found[key][row] = seen.keypoints[name].ravel()
+        seen.append(view.observe())
+    found: Columns = {
+        schema.IMAGES + name: np.stack([one.images[name] for one in seen]) for name in cameras.names
+    }
+    for key, name in spec.keypoint_keys.items():
+        points = np.stack([one.keypoints[name].ravel() for one in seen])
+        found[key] = points.astype(np.float32)
     return found
-
-
-def _count_changed(before: Columns, after: Columns, scale: F64) -> int:
-    gaps = (np.abs(before[schema.ACTION] - after[schema.ACTION]) / scale).max(axis=1)
-    same = (
-        before[key].ravel() == after[key].ravel()
-        for key in (schema.LABEL_VALID, schema.EXPERT_PHASE)
-    )
-    return int((~np.logical_and(*same) | (gaps > NOTICEABLE)).sum())
 
 
 def _leads(source: EditSource, columns: Columns) -> F64:

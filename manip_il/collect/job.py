@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from manip_il.collect.drivers import Driver, ExpertDriver, PolicyDriver, Setting
+from manip_il.collect.drivers import Driver, ExpertDriver, Setting
 from manip_il.collect.query import LabelMode, Query, branch, cut_at_takeover, gate_of, labelled
 from manip_il.collect.rollout import Act, Rules, rollout
 from manip_il.data.episodes import group_rollouts, to_episode
@@ -175,13 +175,10 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
 def _load(job: RolloutJob, checkpoint: Checkpoint) -> LearnedPolicy:
     from manip_il.learn.policy import LearnedPolicy
 
-    driver = job.driver
-    trust, device = (
-        (driver.trust, driver.device) if isinstance(driver, PolicyDriver) else (False, "cpu")
-    )
     spec = env_spec(job.env, observed_cameras(job))
     checkpoint.check_fits(spec)
-    return LearnedPolicy.load(checkpoint, device, spec.instruction, trust=trust)
+    driver = job.driver
+    return LearnedPolicy.load(checkpoint, driver.device, spec.instruction, trust=driver.trust)
 
 
 def _without_pictures(frame: Transition) -> Transition:

@@ -82,9 +82,12 @@ class RayPool:
             The future of the episodes, which come without pictures.
         """
         files = [self._upload(policy.path) for policy in job.driver.policies]
-        task = self._upload(job.env.task) if isinstance(job.env.task, Path) else None
+        world, task = (
+            self._upload(one) if isinstance(one, Path) and one.suffix == ".py" else None
+            for one in (job.env.robot, job.env.task)
+        )
         mesh = self._upload(path) if (path := mesh_path(job.env.object)) else None
-        reference = _run_remote.remote(__version__, job, seeds, journal, task, mesh, *files)
+        reference = _run_remote.remote(__version__, job, seeds, journal, world, task, mesh, *files)
         future: Future[list[Episode]] = Future()
         self._running[future] = reference
         reference.future().add_done_callback(lambda answer: self._settle(future, answer, journal))
@@ -135,6 +138,7 @@ def run_there(
     job: RolloutJob,
     seeds: tuple[int, ...],
     journal: Journal | None,
+    world: Files | None,
     task: Files | None,
     mesh: Files | None,
     *policies: Files,
@@ -146,7 +150,8 @@ def run_there(
         job: The job, with paths on that machine.
         seeds: One for each episode.
         journal: Encodes the episodes; None for no journals.
-        task: Content of the user's own task's files, by relative path; None if the task has none.
+        world: Content of the file of the user's own world, by its name; None if it has none.
+        task: The same for the user's own task.
         mesh: The same for the mesh of the object.
         policies: The same for the folder of each of the driver's policies.
 
@@ -164,9 +169,10 @@ def run_there(
             " there"
         )
     with tempfile.TemporaryDirectory(prefix="manip_il-") as folder:
-        if task is not None:
-            file = _unpack(task, Path(folder) / "task") / Path(job.env.task).name
-            job = replace(job, env=replace(job.env, task=file))
+        for field, files in (("robot", world), ("task", task)):
+            if files is not None:
+                file = _unpack(files, Path(folder) / field) / Path(getattr(job.env, field)).name
+                job = replace(job, env=replace(job.env, **{field: file}))
         if mesh is not None:
             name = Path(str(job.env.object).removeprefix("mesh:")).name  # with the length
             at = _unpack(mesh, Path(folder) / "mesh") / name

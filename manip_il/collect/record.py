@@ -19,8 +19,13 @@ from manip_il.collect.workers import Engine, engine_of
 from manip_il.data.atomic import require_replaceable
 from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
-from manip_il.data.journal import Journal, episode_path, list_seeds, read_journal
-from manip_il.data.video import try_encoder
+from manip_il.data.journal import (
+    Journal,
+    episode_path,
+    journals_of,
+    list_seeds,
+    read_journal,
+)
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import policy_folder
@@ -202,8 +207,6 @@ def record(
     job = make_options(RolloutJob, env=env_of_name(env), driver=driver, **chosen | options)
     episodes = checks.whole("episodes", episodes, 1, BLOCK // MAX_TRIES)
     env_spec(job.env, job.cameras)  # raises if no scene can be made, before anything is written
-    if job.cameras:
-        try_encoder(video, job.cameras.size, job.env.control_hz)
     for folder in () if resume else (root, journals):
         require_replaceable(folder)
     progress.started()
@@ -235,8 +238,3 @@ def record(
         recording.write(journals)
         recording.make(made, root, replace=resume)
     return Dataset.open(root)
-
-
-def journals_of(root: Path) -> Path:
-    """Return the folder of the journals from which a dataset is made."""
-    return root.with_name(f"{root.name}.journals")

@@ -20,11 +20,9 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessP
 from contextlib import AbstractContextManager, nullcontext
 from itertools import islice
 from multiprocessing import forkserver, resource_tracker
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Union
 
 from manip_il.collect.job import RolloutJob
-from manip_il.data.atomic import writing
 from manip_il.data.journal import Journal
 from manip_il.errors import ManipError, UsageError, told
 from manip_il.mdp import Episode
@@ -223,8 +221,7 @@ def open_pool(workers: int, *, learned: bool = False) -> ProcessPoolExecutor:
         learned: As in `start_server`.
     """
     start_server(learned)
-    with writing(Path("/dev/shm")):  # where the pool's locks are
-        return ProcessPoolExecutor(workers, mp_context=_CONTEXT, initializer=_end_with_parent)
+    return ProcessPoolExecutor(workers, mp_context=_CONTEXT, initializer=_end_with_parent)
 
 
 def kill_pool(pool: ProcessPoolExecutor) -> None:

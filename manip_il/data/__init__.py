@@ -8,10 +8,10 @@ columns.
 datasets episode by episode with pyarrow and PyAV: every dataset, whether recorded, built, merged,
 edited or imported, is one call of `write_episodes` with other `EpisodeData`. `build.py` selects
 episodes of rollouts (as they arrive, or from a folder of journals) and merges datasets.
-`dataset.py` opens any LeRobot dataset: `info.py` and `parquet_files.py` parse its `meta/` and
-columns, `camera.py` decodes its pictures, `statistics.py` computes and reads statistics.
-`lerobot_layout.py` has LeRobot's paths and Arrow types, `joined.py` presents several datasets as
-one, `video.py` writes videos. `gate.py` opens untrusted files in a child process.
+`dataset.py` opens any LeRobot dataset, or several as one: `info.py` and `parquet_files.py` parse
+its `meta/` and columns, `camera.py` decodes its pictures, `statistics.py` computes and reads
+statistics. `lerobot_layout.py` has LeRobot's paths and Arrow types, `video.py` writes videos.
+`gate.py` opens untrusted files in a child process.
 
 Guarantees:
 

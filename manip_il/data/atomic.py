@@ -10,7 +10,6 @@ import contextlib
 import ctypes
 import errno
 import fcntl
-import itertools
 import json
 import math
 import os
@@ -276,10 +275,9 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
     """
     lines = checks.read_bytes(path, "JSON lines").splitlines(keepends=True) if path.exists() else []
     whole = [line for line in lines if line.endswith(b"\n")]
-    names = (f"{path}, line {number}" for number in itertools.count(1))
     return [
-        checks.mapping(name, checks.parse_json(name, line))
-        for name, line in zip(names, whole, strict=False)
+        checks.mapping(name := f"{path}, line {number}", checks.parse_json(name, line))
+        for number, line in enumerate(whole, 1)
     ]
 
 

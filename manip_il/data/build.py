@@ -17,7 +17,7 @@ import numpy as np
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import write_json
-from manip_il.data.dataset import Dataset, EpisodeData, Own
+from manip_il.data.dataset import Dataset, Own
 from manip_il.data.episodes import parts
 from manip_il.data.fingerprint import compare_fingerprints, file_sha256
 from manip_il.data.info import PICTURES, Info, reading
@@ -30,11 +30,7 @@ from manip_il.mdp import KEYPOINTS, Episode
 
 _LOG = logging.getLogger(__name__)
 RECORDING = "recording.json"
-# settings of an encoder, which may differ between films of a camera
-_ENCODER = [
-    f"video.{one}"
-    for one in ("g", "crf", "preset", "fast_decode", "video_backend", "extra_options")
-]
+_CODEC = ("video.codec", "video.pix_fmt")  # what all films of a camera have in common
 Rollouts = Iterable[tuple[Journal, Episode]]
 
 
@@ -90,7 +86,7 @@ class Recording:
         Args:
             rollouts: In seed order; all are consumed, even after a limit is reached.
             root: The new folder.
-            replace: As in `new_folder`.
+            replace: Whether to replace a dataset of ours at `root`.
 
         Raises:
             MismatchError: A rollout has another robot, task or cameras.
@@ -198,15 +194,15 @@ def merge_datasets(
 
     Equal to `write_dataset` of all their episodes if ours.
 
-    Every column, every frame's text and the video files are copied. Datasets of ours are described
-    as such: the fingerprint is the first one's, and if another differs, a warning is logged; the
-    names and provenance of the sources are added to `provenance`.
+    Every column, every frame's text and whole video files are copied. Datasets of ours are
+    described as such: the fingerprint is the first one's, and if another differs, a warning is
+    logged; the names and provenance of the sources are added to `provenance`.
 
     Args:
         roots: The datasets.
         root: The new one.
         provenance: Its origin, if a dataset is ours.
-        replace: As in `new_folder`.
+        replace: Whether to replace a dataset of ours at `root`.
         episodes: Episodes to keep, as in `choose_episodes`, numbered as in the merged datasets; by
             default all.
         renamed: Camera -> its new name, both with `observation.images.`.
@@ -231,18 +227,11 @@ def merge_datasets(
             if features.setdefault(key, feature)["dtype"] == "image":
                 features[key] = feature
 
-    def chosen() -> Iterator[EpisodeData]:
-        before = 0
-        for dataset in opened:
-            cut = not kept.issuperset(range(before, before + dataset.info.episodes))
-            for one in dataset.stored_episodes(renamed=names):
-                if before + one.number in kept:
-                    yield dataclasses.replace(one, cut=cut)
-            before += dataset.info.episodes
-
+    stored = itertools.chain.from_iterable(one.stored_episodes(renamed=names) for one in opened)
+    chosen = (one for number, one in enumerate(stored) if number in kept)
     about = opened[0].fps, opened[0].info.robot, own
     return write_episodes(
-        chosen(), root, features, *about, tables=opened[0].other_tables, replace=replace
+        chosen, root, features, *about, tables=opened[0].other_tables, replace=replace
     )
 
 
@@ -330,9 +319,7 @@ def _facts(dataset: Dataset, names: Mapping[str, str]) -> dict[str, str]:
         name, kind = names.get(key, key), "pictures" if one.dtype in PICTURES else one.dtype
         facts[f"column {name}"] = f"{kind} of shape {[*one.shape]}, named {one.names}"
         facts |= {
-            f"film {name}: {what}": str(value)
-            for what, value in one.details.items()
-            if what not in _ENCODER
+            f"film {name}: {what}": one.details[what] for what in _CODEC if what in one.details
         }
     for key in {key for row in dataset.episodes.others for key in row} - {layout.DRAWN}:
         facts[f"column {key} of meta/episodes"] = "a column"

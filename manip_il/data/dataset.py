@@ -69,21 +69,15 @@ class EpisodeData:
             Arrow arrays.
         tasks: The text of every frame.
         others: Values in the columns of `meta/episodes` that LeRobot does not have.
-        dataset: Where it is stored.
-        number: Its number there.
-        films: Its frames in the films of each camera there.
+        films: Its frames in the stored films of each camera.
         picture_statistics: Stored statistics of its pictures, by camera.
-        cut: Whether only its part of a film is copied, not the whole file.
     """
 
     columns: Mapping[str, Column]
     tasks: Sequence[str]
     others: Mapping[str, Any] = field(default_factory=dict)
-    dataset: Dataset | None = None
-    number: int = 0
     films: Mapping[str, FrameRange] = field(default_factory=dict)
     picture_statistics: Statistics = field(default_factory=dict)
-    cut: bool = False
 
 
 class Dataset:
@@ -290,11 +284,12 @@ class Dataset:
 
     def _film_ranges(self, key: str) -> list[FrameRange]:
         """Return where a camera's films hold each episode."""
-        table, clips = self.episodes, self.episodes.clips[key]
-        firsts = np.round(clips.starts * self.fps).astype(np.int64).tolist()
-        paths = (self.root / file for file in clips.files)
-        rows = zip(paths, firsts, table.length.tolist(), table.start.tolist(), strict=True)
-        return [FrameRange(*row) for row in rows]
+        table = self.episodes
+        rows = zip(table.clips[key], table.length.tolist(), table.start.tolist(), strict=True)
+        return [
+            FrameRange(self.root / file, round(start * self.fps), length, row)
+            for (file, start), length, row in rows
+        ]
 
     def frames(self, key: str, rows: I64) -> NDArray[np.uint8]:
         """Return a camera's decoded pictures, (B, height, width, 3), of these rows, (B,)."""
@@ -369,8 +364,6 @@ class Dataset:
                     columns={new[name]: column[rows] for name, column in columns.items()},
                     tasks=texts[rows],
                     others=undrawn | table.others[place],
-                    dataset=self,
-                    number=int(table.index[place]),
                     films={new[key]: ranges[place] for key, ranges in films.items()},
                     picture_statistics={new[key]: one for key, one in statistics[place].items()},
                 )

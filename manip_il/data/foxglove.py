@@ -9,8 +9,9 @@ PNG's bytes and a fifth of its time.
 """
 
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from fractions import Fraction
+from functools import cache
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -30,8 +31,8 @@ from manip_il.mdp import Episode
 from manip_il.worlds.contract import EnvironmentSpec
 
 U8 = NDArray[np.uint8]
-Times = Sequence[int]  # [ns], one per frame
-Messages = Iterator[Message | str]  # one per frame, all of one class; scalars are JSON texts
+Encode = Callable[[Any, Timestamp], Message | str]  # a frame's value and time -> message, or JSON
+Channel = tuple[Encode, Iterable[Any]]  # with one value per frame
 
 NANOSECONDS = 1_000_000_000
 IMAGE_TOPICS = "/observation/images/"  # prefix of a camera's topic, as in LeRobot
@@ -56,47 +57,39 @@ def frame_times(count: int, rate: Fraction) -> list[int]:
     return [frame * NANOSECONDS * rate.denominator // rate.numerator for frame in range(count)]
 
 
-def joint_states(names: Sequence[str], values: NDArray[Any], times: Times) -> Messages:
-    """Yield one message of joint positions per frame.
+def joint_states(names: Sequence[str]) -> Encode:
+    """Return the encoder of rows of joint positions, (n,) Python numbers, of n named joints."""
 
-    Args:
-        names: Names of the n joints.
-        values: The positions, (T, n).
-        times: Times of the T frames [ns].
-    """
-    for time, row in zip(times, values.tolist(), strict=True):
+    def encode(row: Sequence[float], time: Timestamp) -> Message:
         joints = [
             JointState(name=name, position=position)
             for name, position in zip(names, row, strict=True)
         ]
-        yield JointStates(timestamp=_stamp(time), joints=joints)
+        return JointStates(timestamp=time, joints=joints)
+
+    return encode
 
 
-def scalars(labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Messages:
-    """Yield one JSON message of labelled numbers per row.
+def scalars(labels: Sequence[str]) -> Encode:
+    """Return the encoder of rows of labelled Python numbers, which must be finite, as JSON."""
 
-    Args:
-        labels: Names of the numbers.
-        rows: T rows of Python numbers, which must be finite.
-    """
-    for row in rows:
+    def encode(row: Sequence[float], time: Timestamp) -> str:
         pairs = zip(labels, row, strict=True)
         # + for bools
-        yield json.dumps({"scalars": [{"label": label, "value": +value} for label, value in pairs]})
+        return json.dumps(
+            {"scalars": [{"label": label, "value": +value} for label, value in pairs]}
+        )
+
+    return encode
 
 
-def images(frame_id: str, pictures: Iterable[U8], times: Times) -> Messages:
-    """Yield one message per picture, uncompressed.
+def images(frame_id: str) -> Encode:
+    """Return the encoder of a camera's RGB pictures, (height, width, 3), uncompressed."""
 
-    Args:
-        frame_id: Name of the camera.
-        pictures: T RGB pictures, each (height, width, 3).
-        times: Times of the T frames [ns].
-    """
-    for time, picture in zip(times, pictures, strict=True):
+    def encode(picture: U8, time: Timestamp) -> Message:
         height, width, depth = picture.shape
-        yield RawImage(
-            timestamp=_stamp(time),
+        return RawImage(
+            timestamp=time,
             frame_id=frame_id,
             height=height,
             width=width,
@@ -105,88 +98,70 @@ def images(frame_id: str, pictures: Iterable[U8], times: Times) -> Messages:
             data=picture.tobytes(),
         )
 
-
-def texts(name: str, lines: Iterable[str], times: Times) -> Messages:
-    """Yield one log message per line.
-
-    Args:
-        name: The source that the messages name.
-        lines: T lines.
-        times: Times of the T frames [ns].
-    """
-    for time, line in zip(times, lines, strict=True):
-        yield Log(timestamp=_stamp(time), level=Log.Level.INFO, name=name, message=line)
+    return encode
 
 
-def _stamp(time: int) -> Timestamp:
-    seconds, nanos = divmod(time, NANOSECONDS)
-    return Timestamp(seconds=seconds, nanos=nanos)
+def texts(name: str) -> Encode:
+    """Return the encoder of lines of text. name: the source that the messages name."""
+    return lambda line, time: Log(timestamp=time, level=Log.Level.INFO, name=name, message=line)
 
 
-def episode_channels(episode: Episode, times: Times, spec: EnvironmentSpec) -> dict[str, Messages]:
-    """Return the messages of an episode's columns.
-
-    Args:
-        episode: The episode, with T frames.
-        times: Times of the frames [ns].
-        spec: Names the numbers of states and actions.
-
-    Returns:
-        Topic -> messages, one per frame.
-    """
+def episode_channels(episode: Episode, spec: EnvironmentSpec) -> dict[str, Channel]:
+    """Return an episode's columns by topic. spec: names the numbers of states and actions."""
     columns = episode.columns
-    found = {
-        topic: joint_states(
-            spec.observed_names if key == s.STATE else spec.joint_names, columns[key], times
+    found: dict[str, Channel] = {
+        topic: (
+            joint_states(spec.observed_names if key == s.STATE else spec.joint_names),
+            columns[key].tolist(),
         )
         for topic, key in _JOINT_TOPICS.items()
         if key in columns
     }
     if numbers := {key: columns[key].reshape(-1) for key in _SCALARS if key in columns}:
         rows = zip(*(column.tolist() for column in numbers.values()), strict=True)
-        found["/scalars"] = scalars(list(numbers), rows)
+        found["/scalars"] = scalars(list(numbers)), rows
     for key, pictures in columns.items():
         if key.startswith(s.IMAGES):
             camera = key.removeprefix(s.IMAGES)
-            found[IMAGE_TOPICS + camera] = images(camera, pictures, times)
+            found[IMAGE_TOPICS + camera] = images(camera), pictures
     return found
 
 
-def add_channels(writer: Writer, channels: Mapping[str, Messages], times: Times) -> None:
+def add_channels(writer: Writer, channels: Mapping[str, Channel], times: Sequence[int]) -> None:
     """Write all messages to a file, frame by frame.
 
     Args:
         writer: The open file.
-        channels: Topic -> messages, one per frame.
-        times: Times of the frames [ns].
+        channels: Topic -> its encoder and T values.
+        times: Times of the T frames [ns].
 
     Raises:
         ValueError: if the channels and `times` differ in length.
     """
-    schemas: dict[type, int] = {}  # class of messages -> its schema
-    ids: dict[str, int] = {}
-    for frame, (time, messages) in enumerate(
-        zip(times, zip(*channels.values(), strict=True), strict=bool(channels))
-    ):
-        for topic, message in zip(channels, messages, strict=True):
-            kind = type(message)
-            if kind not in schemas:
-                scalars = _SCALARS_NAME, "jsonschema", _SCALARS_SCHEMA
-                schemas[kind] = (
-                    writer.register_schema(*scalars)
-                    if kind is str
-                    else register_schema(writer, kind)
-                )
-            if topic not in ids:
-                ids[topic] = writer.register_channel(
-                    topic, "json" if kind is str else "protobuf", schemas[kind]
-                )
+
+    @cache
+    def schema_of(kind: type) -> int:
+        if kind is str:
+            return writer.register_schema(_SCALARS_NAME, "jsonschema", _SCALARS_SCHEMA)
+        return register_schema(writer, kind)
+
+    @cache
+    def channel_of(topic: str, kind: type) -> int:
+        encoding = "json" if kind is str else "protobuf"
+        return writer.register_channel(topic, encoding, schema_of(kind))
+
+    rows = zip(times, *(values for _, values in channels.values()), strict=True)
+    for frame, (time, *row) in enumerate(rows):
+        seconds, nanos = divmod(time, NANOSECONDS)
+        stamp = Timestamp(seconds=seconds, nanos=nanos)
+        for (topic, (encode, _)), value in zip(channels.items(), row, strict=True):
+            message = encode(value, stamp)
             data = (
                 message.encode()
                 if isinstance(message, str)
                 else message.SerializeToString(deterministic=True)
             )
-            writer.add_message(ids[topic], time, data, time, frame)
+            writer.add_message(channel_of(topic, type(message)), time, data, time, frame)
 
 
 def read_images(stream: BinaryIO, cameras: Collection[str]) -> dict[str, U8]:

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UsageError
 
 PICTURES = ("video", "image")
 NUMBERS = (
@@ -137,12 +137,19 @@ def reading(path: Path) -> Generator[None]:
 def read_info(root: Path) -> Info:
     """Read `meta/info.json` of a dataset.
 
-    Raises `ManipError` if it is missing, has another version, or names files otherwise than LeRobot
-    does.
+    Raises `UsageError` if there is no such folder, `ManipError` if the file is missing, has another
+    version, or names files otherwise than LeRobot does.
     """
     path = root / layout.INFO
+    if not root.exists():
+        raise UsageError(
+            f"{root} does not exist; expected a LeRobot v3.0 dataset; one on the Hub must be pulled"
+            " first: manip-il pull hf://datasets/USER/NAME FOLDER"
+        )
     if not path.exists():
-        raise ManipError(f"{root} is not a LeRobot dataset: {layout.INFO} is missing")
+        raise ManipError(
+            f"{root} is not a LeRobot dataset: {layout.INFO} is missing"
+        )
     raw = checks.read_json(path, "a dataset's description")
     version = raw.get("codebase_version")
     if version != layout.VERSION:

@@ -51,7 +51,7 @@ class Journal:
         writer.start(profile="", library=_RECORD)
         writer.add_metadata(_RECORD, _to_texts(self, episode))
         times = foxglove.frame_times(len(episode), exact_rate(self.spec.fps))
-        channels = foxglove.episode_channels(episode, times, self.spec)
+        channels = foxglove.episode_channels(episode, self.spec)
         foxglove.add_channels(writer, channels, times)
         for key, column in episode.columns.items():
             if not key.startswith(IMAGES):  # pictures are stored as lossless messages
@@ -169,3 +169,8 @@ def _to_texts(journal: Journal, episode: Episode) -> dict[str, str]:
     }
     values |= {"drawn": dict(episode.drawn)} if episode.drawn else {}
     return {"format": _FORMAT} | {name: json.dumps(value) for name, value in values.items()}
+
+
+def journals_of(root: Path) -> Path:
+    """Return the folder next to a dataset that holds its journals; it may not exist."""
+    return root.absolute().with_name(f"{root.absolute().name}.journals")

@@ -12,6 +12,8 @@ from typing import Any
 
 import pyarrow as pa
 
+from manip_il.data.atomic import write_file
+
 Features = dict[str, dict[str, Any]]  # column or camera -> dtype, shape per frame, names
 VERSION = "v3.0"
 INFO = "meta/info.json"
@@ -108,6 +110,5 @@ def numbered(template: str, number: int, **names: str) -> tuple[str, int, int]:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write `data` in LeRobot's JSON layout."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(data, indent=4, ensure_ascii=False), encoding="utf-8")
+    """Write `data` in LeRobot's JSON layout, atomically as `write_file` does."""
+    write_file(path, json.dumps(data, indent=4, ensure_ascii=False).encode())

@@ -25,7 +25,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import NUMBERS, Feature, Info, reading
 from manip_il.data.statistics import Statistics
 from manip_il.errors import ManipError
-from manip_il.mdp import F64, I64
+from manip_il.mdp import I64
 
 Column = Any  # numpy array, (T,) or (T, ...); of datasets, all but numbers are Arrow arrays
 
@@ -209,16 +209,6 @@ def to_numpy(column: pa.ChunkedArray, feature: Feature) -> Column:
 
 
 @dataclass(frozen=True)
-class VideoSpans:
-    """Where one camera's episodes are, one entry per episode: the video file, and the start in
-    it [s].
-    """
-
-    files: list[str]
-    starts: F64
-
-
-@dataclass(frozen=True)
 class EpisodeTable:
     """Columns with one entry per episode.
 
@@ -228,7 +218,7 @@ class EpisodeTable:
         start: First rows.
         stop: Last rows plus one.
         tasks: Texts of the tasks.
-        clips: Column of a camera -> where its episodes are.
+        clips: Column of a camera -> each episode's video file, and its start in it [s].
         others: Values in the columns that LeRobot does not have.
     """
 
@@ -237,7 +227,7 @@ class EpisodeTable:
     start: I64
     stop: I64
     tasks: list[list[str]]
-    clips: dict[str, VideoSpans]  # by camera column
+    clips: dict[str, list[tuple[str, float]]]
     others: list[dict[str, Any]]
 
     def __len__(self) -> int:
@@ -255,14 +245,14 @@ def read_episode_table(root: Path, info: Info) -> EpisodeTable:
         def numbers(name: str) -> I64:
             return table.column(name).cast(pa.int64()).to_numpy()
 
-        def clips(key: str) -> VideoSpans:
+        def clips(key: str) -> list[tuple[str, float]]:
             chunks = numbers(f"videos/{key}/chunk_index").tolist()
             files = numbers(f"videos/{key}/file_index").tolist()
-            paths = [
-                layout.VIDEO_PATH.format(chunk_index=chunk, file_index=file, video_key=key)
-                for chunk, file in zip(chunks, files, strict=True)
+            starts = table.column(f"videos/{key}/from_timestamp").to_pylist()
+            return [
+                (layout.VIDEO_PATH.format(chunk_index=chunk, file_index=file, video_key=key), start)
+                for chunk, file, start in zip(chunks, files, starts, strict=True)
             ]
-            return VideoSpans(paths, table.column(f"videos/{key}/from_timestamp").to_numpy())
 
         tasks = (
             table.column("tasks").to_pylist()

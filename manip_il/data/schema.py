@@ -39,6 +39,10 @@ MUST_AGREE = (
     "environment_state_names",
     "action_meaning",
 )
+_SCALARS = {  # column -> dtype
+    **{PROGRESS: "float32", REWARD: "float32", SUCCESS: "bool", DONE: "bool"},
+    **{SEED: "int64", ROUND: "int64", BETA: "float32"},
+}
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")  # in the name of a robot
 
 
@@ -81,13 +85,7 @@ def features(spec: EnvironmentSpec) -> dict[str, dict[str, Any]]:
         LABEL_VALID: _feature("int64", ["label_valid"]),
         EXPERT_PHASE: _feature("int64", ["phase"]),
         SIM_STATE: {"dtype": "float64", "shape": (spec.sim_state_size,), "names": None},
-        PROGRESS: _feature("float32", ["progress"]),
-        REWARD: _feature("float32", ["reward"]),
-        SUCCESS: _feature("bool", ["success"]),
-        DONE: _feature("bool", ["done"]),
-        SEED: _feature("int64", ["seed"]),
-        ROUND: _feature("int64", ["round"]),
-        BETA: _feature("float32", ["beta"]),
+        **{key: _feature(dtype, [key.removeprefix("next.")]) for key, dtype in _SCALARS.items()},
     }
 
 

@@ -5,10 +5,9 @@ settings are copied here (and tests compare the two), because importing `lerobot
 imports torch, which takes seconds.
 """
 
-import itertools
 import os
 import shutil
-from contextlib import closing, suppress
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,8 @@ from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.camera import FrameRange, Pictures, open_video
+from manip_il.data.camera import Pictures
 from manip_il.data.dataset import EpisodeData
-from manip_il.data.info import reading
 from manip_il.data.schema import exact_rate
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import UsageError
@@ -56,48 +54,46 @@ class CameraFiles:
         self._bytes = 0
         self._container: Any = None  # the open file
         self._stream: Any = None
-        self._copied: dict[Any, dict[str, Any]] = {}  # source -> its place in the new dataset
+        self._copied: dict[Path, dict[str, Any]] = {}  # source -> its place in the new dataset
         self.size: tuple[int, int] | None = None
 
     def copy(self, episode: EpisodeData) -> dict[str, Any]:
-        """Copy the video file that holds an episode, unless already copied.
+        """Copy the whole video file that holds an episode, unless already copied.
 
         Return the columns of its row.
         """
         film = episode.films[self._key]
-        source = episode.dataset, film.path
-        if episode.cut or source not in self._copied:
+        if film.path not in self._copied:
             self.close()
-            path, self._copied[source] = self._next_file()
-            if episode.cut:
-                _cut(film, path, self._fps)
-            else:
-                with checks.native_path(film.path, "an MP4 file") as opened:
-                    shutil.copyfile(opened, path)
+            path, self._copied[film.path] = self._next_file()
+            with checks.native_path(film.path, "an MP4 file") as opened:
+                shutil.copyfile(opened, path)
             self._number += 1
-        return self._copied[source] | self._times(0 if episode.cut else film.first, film.count)
+        return self._copied[film.path] | self._times(film.first, film.count)
 
     def write(self, frames: Pictures) -> dict[str, Any]:
         """Append the frames of an episode; return the columns of its row.
 
-        Raises `av.FFmpegError` if they cannot be encoded or written.
+        Raises `UsageError` if the encoder refuses its settings, and `av.FFmpegError` if the frames
+        cannot be written.
         """
         if self._bytes >= layout.VIDEO_FILES_SIZE_IN_MB * 2**20:
             self.close()
         path, place = self._next_file()
         self.size = size = frames.shape[1], frames.shape[2]
+        encoder: Any
         if self._container is None:
             self._container = av.open(str(path), "w", options=_OPTIONS)
             self._stream = self._container.add_stream(self._config.vcodec, self._rate)
             encoder = self._stream.codec_context
         else:  # a new encoder, so that its bytes do not depend on other episodes
             encoder = av.CodecContext.create(self._config.vcodec, "w")
-        _set_up(encoder, self._config, size, self._rate)
+        _open(encoder, self._config, size, self._rate)
         times = self._times(self._frames, len(frames))
         for picture in frames:
-            self._mux(_encode(encoder, _video_frame(picture, self._frames, self._rate)))
+            self._mux(encoder.encode(_video_frame(picture, self._frames, self._rate)))
             self._frames += 1
-        self._mux(_encode(encoder, None))
+        self._mux(encoder.encode(None))
         return place | times
 
     def close(self) -> None:
@@ -159,91 +155,34 @@ class CameraFiles:
             self._container.mux_one(packet)
 
 
-def _cut(film: FrameRange, target: Path, fps: float) -> None:
-    """Copy frames of a video file as they are encoded.
-
-    Raises `ManipError` if they need frames before them.
-    """
-    with (
-        reading(film.path),
-        closing(open_video(film.path)) as source,
-        av.open(str(target), "w", options=_OPTIONS) as container,
-    ):
-        stream = source.streams.video[0]
-        own = container.add_stream_from_template(stream, opaque=True)
-        rate = fps * float(stream.time_base or 1)  # [frames/tick]
-        # to the last key frame at or before it
-        source.seek(round(film.first / rate), stream=stream)
-        inside = (
-            packet
-            for packet in source.demux(stream)
-            if packet.size and 0 <= round((packet.pts or 0) * rate) - film.first < film.count
-        )
-        packets: list[Any] = [*itertools.islice(inside, film.count)]
-        if len(packets) != film.count or not packets[0].is_keyframe:
-            last = film.first + film.count - 1
-            raise ValueError(
-                f"frames {film.first} to {last} cannot be cut out without encoding them again"
-            )
-        start = packets[0].pts or 0
-        for packet in packets:
-            packet.pts = (packet.pts or 0) - start
-            packet.dts = (packet.dts or 0) - start
-            packet.stream = own
-            container.mux_one(packet)
-
-
-def _encode(encoder: Any, frame: av.VideoFrame | None) -> list[Any]:
-    """Encode a frame, or None to flush; the first one opens the encoder.
+def _open(encoder: Any, config: VideoConfig, size: tuple[int, int], rate: Fraction) -> None:
+    """Open an encoder. Raises `UsageError` if it refuses its settings.
 
     If run by root, SVT-AV1 permanently gives real-time priority (SCHED_FIFO) to the calling thread
     and to its worker threads, which with their child processes would starve all other processes.
     This undoes it.
     """
-    opens = not encoder.is_open
-    packets = encoder.encode(frame)
-    if opens and os.geteuid() == 0 and encoder.name == "libsvtav1":
-        for thread in map(int, os.listdir("/proc/self/task")):
-            with suppress(OSError):  # the thread has ended
-                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
-    return packets
-
-
-def _set_up(encoder: Any, config: VideoConfig, size: tuple[int, int], rate: Fraction) -> None:
     # errors only; otherwise it prints its version for every encoder
     os.environ.setdefault("SVT_LOG", "1")
     encoder.options = config.options()
     encoder.height, encoder.width = size
-    encoder.pix_fmt = config.pix_fmt
     encoder.framerate = rate
     encoder.time_base = 1 / rate
+    try:
+        encoder.pix_fmt = config.pix_fmt
+        encoder.open()
+    except (av.FFmpegError, ValueError) as error:
+        expected = f"expected even sizes and settings of {config.vcodec}"
+        raise UsageError(
+            f"cannot encode {size[1]} x {size[0]} pictures with {config}: {error}; {expected}"
+        ) from error
+    if os.geteuid() == 0 and encoder.name == "libsvtav1":
+        for thread in map(int, os.listdir("/proc/self/task")):
+            with suppress(OSError):  # the thread has ended
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _video_frame(picture: NDArray[np.uint8], number: int, rate: Fraction) -> av.VideoFrame:
     frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
     frame.pts, frame.time_base = number, 1 / rate
     return frame
-
-
-def try_encoder(config: VideoConfig, size: tuple[int, int], fps: float) -> None:
-    """Encode one black picture, to find out whether the encoder accepts its settings.
-
-    Args:
-        config: Settings of the encoder.
-        size: Height and width of the picture [pixels].
-        fps: Rate of the video [frames/s].
-
-    Raises:
-        UsageError: if the picture cannot be encoded.
-    """
-    rate = exact_rate(fps)
-    try:
-        encoder = av.CodecContext.create(config.vcodec, "w")
-        _set_up(encoder, config, size, rate)
-        _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, rate))
-        _encode(encoder, None)
-    except (av.FFmpegError, ValueError) as error:
-        expected = f"expected even sizes and settings of {config.vcodec}"
-        raise UsageError(
-            f"cannot encode {size[1]} x {size[0]} pictures with {config}: {error}; {expected}"
-        ) from error

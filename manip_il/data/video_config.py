@@ -15,7 +15,7 @@ class VideoConfig:
     """Settings of the encoder, named as in LeRobot's `RGBEncoderConfig`, with the same defaults for
     `libsvtav1`.
 
-    Raises `UnknownName` for an unknown codec; `try_encoder` checks the other settings.
+    Raises `UnknownName` for an unknown codec; the encoder checks the other settings.
     """
 
     vcodec: str = option("h264", "h264, or libsvtav1 (LeRobot's own choice, slower)")

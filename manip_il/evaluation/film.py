@@ -54,7 +54,7 @@ def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str
     camera = spec.default_cameras[0]
     pictures = render_states(env, CameraConfig((camera,), *_SIZE, FILM), states)
     frames = list(pictures[schema.IMAGES + camera])
-    return Film(title, encode_mp4(frames, env.control_hz // FILM_EVERY or 1), caption)
+    return Film(title, encode_mp4(frames, env.control_hz / FILM_EVERY), caption)
 
 
 def collect_films(made: Iterable[Film], progress: Progress) -> tuple[list[Film], str]:

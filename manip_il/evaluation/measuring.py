@@ -16,7 +16,6 @@ from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import UsageError, shorten
 from manip_il.evaluation.eval_report import eval_report
 from manip_il.evaluation.film import film_outcomes, run_states
-from manip_il.evaluation.report import REPORT_FILE
 from manip_il.evaluation.results import EpisodeResult, EvalResult, require_equal
 from manip_il.evaluation.runner import (
     FOLDER,
@@ -25,7 +24,6 @@ from manip_il.evaluation.runner import (
     measure,
     replay_differences,
 )
-from manip_il.evaluation.runner import evaluate as run_episodes
 from manip_il.evaluation.side import Side
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.learn.checkpoint import Checkpoint, policy_folder
@@ -111,16 +109,19 @@ def evaluate(
         seeds = stream_seeds(stream, first + count, seed)[first:]
         name = kind if policy is None else str(getattr(policy, "path", policy))
         progress.started()
-        if output_dir is None:
-            return run_episodes(
-                engine, job, seeds, name, progress.episode, suite=suite, until_width=until_width
-            )
         result = measure(
-            engine, job, seeds, name, output_dir, progress, suite=suite, until_width=until_width
+            engine,
+            job,
+            seeds,
+            name,
+            progress,
+            folder=output_dir,
+            suite=suite,
+            until_width=until_width,
         )
         made = film_outcomes(engine, job, result, films, progress)
-    if about is not None:
-        replace(eval_report(result, *made), **about).write(output_dir / REPORT_FILE)
+    if output_dir is not None and about is not None:
+        replace(eval_report(result, *made), **about).write(output_dir)
     return result
 
 
@@ -169,7 +170,15 @@ def measure_sides(
         digest = job.policy.sha256[:8] if job.policy else driver.name
         words = f"{re.sub(r'[^A-Za-z0-9]+', '_', member.name)[-80:]}_{digest}"
         results.append(
-            measure(engine, job, seeds, member.name, folder / FOLDER / words, progress, suite=suite)
+            measure(
+                engine,
+                job,
+                seeds,
+                member.name,
+                progress,
+                folder=folder / FOLDER / words,
+                suite=suite,
+            )
         )
     found = iter(results)
     return tuple(

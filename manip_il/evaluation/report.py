@@ -94,6 +94,8 @@ class Report:
         )
         return environment.get_template("report.html.j2").render(report=self)
 
-    def write(self, path: Path) -> None:
-        """Write the page to `path` atomically, creating its folder."""
+    def write(self, folder: Path) -> Path:
+        """Write `report.html` atomically, creating its folder; return its path."""
+        path = folder / REPORT_FILE
         write_file(path, self.render().encode())
+        return path

@@ -2,7 +2,7 @@
 expert on every task.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,18 +15,19 @@ from manip_il.collect.workers import Engine
 from manip_il.errors import RenderError, UsageError
 from manip_il.evaluation.figures import INK, Figure, drawing, to_figure
 from manip_il.evaluation.report import Report, Section
-from manip_il.evaluation.results import EpisodeResult, EvalResult
-from manip_il.evaluation.runner import evaluate
+from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.runner import measure
 from manip_il.evaluation.suites import read_condition
 from manip_il.evaluation.tables import CLONING, EXPERT, INTERVAL, Table
 from manip_il.option import NameOrPath
+from manip_il.progress import Progress
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import NOMINAL
-from manip_il.sim.config import CAMERAS, FILM
-from manip_il.sim.render import framed_picture
+from manip_il.sim.config import CAMERAS, FILM, CameraConfig
+from manip_il.sim.render import pictures
 from manip_il.sim.scene import PREFIX
 from manip_il.sim.world import Scene, World
 from manip_il.worlds.ladder.world import scene_of
@@ -115,7 +116,7 @@ def check_robot(
     tasks: Sequence[str],
     episodes: int,
     engine: Engine,
-    on_result: Callable[[EpisodeResult], object],
+    progress: Progress,
 ) -> RobotCheck:
     """Measure a robot on tasks.
 
@@ -124,7 +125,7 @@ def check_robot(
         tasks: Names of tasks.
         episodes: Episodes per task without random actions, and as many with.
         engine: What runs them.
-        on_result: Called with every episode's result as it ends.
+        progress: Follows the episodes.
 
     Raises:
         UsageError: If the robot itself cannot be used.
@@ -139,9 +140,7 @@ def check_robot(
                     make_config(name, task.name), hold=HOLD, label="last", conditions=(condition,)
                 )
                 seeds = stream_seeds("validation", episodes)
-                found.append(
-                    evaluate(engine, job, seeds, "expert", on_result, suite=condition.name)
-                )
+                found.append(measure(engine, job, seeds, "expert", progress, suite=condition.name))
             checked[place] = replace(task, clean=found[0], noisy=found[1])
     table = float(_reached(robot, robot.workspace.half_width, 41).mean())
     return RobotCheck(name, robot, scene.gripper.most, table, tuple(checked))
@@ -325,8 +324,9 @@ def looks(name: NameOrPath) -> Figure:
     data = _at_home(scene)
     data.mocap_pos[:, 2] = -9.0  # move goals out of sight
     with drawing(len(CAMERAS), size=_VIEW) as (drawn, axes):
-        for axis, camera in zip(axes[0], CAMERAS, strict=True):
-            axis.imshow(framed_picture(scene, data, camera, (480, 640), FILM))
+        seen = pictures(scene, data, CameraConfig(CAMERAS, 480, 640, FILM), axes=True)
+        for axis, (camera, picture) in zip(axes[0], seen.items(), strict=True):
+            axis.imshow(picture)
             axis.set_title(f"camera {camera}")
             axis.axis("off")
         return to_figure(drawn, "The arm at home in its scene")

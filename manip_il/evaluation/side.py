@@ -124,11 +124,6 @@ class Side:
         return tuple(member.test for member in self.members)
 
     @property
-    def policies(self) -> tuple[Path, ...]:
-        """The folders of the policies; empty for evaluations."""
-        return tuple(member.policy for member in self.members if member.policy is not None)
-
-    @property
     def rate(self) -> float:
         """Mean success over training seeds."""
         return fmean(result.success.rate for result in self.results)

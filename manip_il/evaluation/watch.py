@@ -13,7 +13,7 @@ from manip_il.data import schema
 from manip_il.mdp import F64, Actor, Transition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import phases
-from manip_il.sim.window import Clock, Window
+from manip_il.sim.view import Clock, Window
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import env_spec
 

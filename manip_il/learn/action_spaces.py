@@ -16,19 +16,16 @@ objects and goals are observed in the world frame, so that a motion towards an o
 numbers for any orientation of the hand, and benchmarks (robosuite's OSC_POSE, gymnasium-robotics)
 use the same convention. It is as long as the robot's action, so that the network's output fits the
 environment; the numbers between the first six and the opening are 0 and are ignored. The arm needs
-at least six joints. Decoding finds q* near q with FK(q*) = (p + dp, exp(dR) R) (`ArmIK.moved`). It
-recovers the pose up to rounding, but not the joints: an arm with seven joints can move its elbow
-without moving the hand, which six numbers do not encode. As in the expert, a posture task that
-pulls towards the home posture determines the elbow. If the pose is out of reach, the hand
-approaches it.
+at least six joints, in [rad], not in degrees as those of robots whose YAML has `lerobot`. Decoding
+finds q* near q with FK(q*) = (p + dp, exp(dR) R) (`ArmIK.moved`). It recovers the pose up to
+rounding, but not the joints: an arm with seven joints can move its elbow without moving the hand,
+which six numbers do not encode. As in the expert, a posture task that pulls towards the home
+posture determines the elbow. If the pose is out of reach, the hand approaches it.
 
 Each action is relative to the state measured at its own step: an action of a plan is converted at
 the step in which it is executed, so that plans of many actions (ACT's chunks, diffusion's horizons)
 are also converted exactly. Policies that learn plans are trained, for each frame of the window, on
 the target minus the state of that frame.
-
-Robots whose YAML has `lerobot` use degrees and 0 to 100 in s and a, but [m] and [rad] for the
-motion of the hand.
 
 `mlp` and `cnn` learn `joint_delta` by default. The network (`MLPNetwork`), which has the measured
 joints as inputs anyway, adds them itself, so that an exported network needs no conversion; for
@@ -47,9 +44,7 @@ from numpy.typing import NDArray
 from manip_il.caching import cached_per_thread
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA, JOINT_TARGET
-from manip_il.mdp import F64
 from manip_il.robots.geometry import rotation_vector
-from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.worlds.contract import GRIPPERS, JOINT_TARGETS, EnvironmentSpec
 
@@ -75,7 +70,7 @@ class Conversion:
 
     Raises:
         UnknownName: The robot is unknown.
-        UsageError: The arm has fewer than six joints.
+        UsageError: The arm has fewer than six joints, or its joints are in degrees.
     """
 
     space: str = JOINT_TARGET
@@ -85,10 +80,11 @@ class Conversion:
     def __post_init__(self) -> None:
         if self.space != EE_DELTA:
             return
-        if (joints := len(self._robot.joints)) < _POSE:
+        robot = get_robot(self.robot)
+        if (joints := len(robot.joints)) < _POSE or robot.lerobot is not None:
             raise UsageError(
-                f"{EE_DELTA} needs an arm with at least {_POSE} joints; {self.robot} has {joints};"
-                f" use {JOINT_DELTA}"
+                f"{EE_DELTA} needs an arm with at least {_POSE} joints [rad]; {self.robot} has"
+                f" {joints}{' [deg]' if robot.lerobot else ''}; use {JOINT_DELTA}"
             )
 
     def encode(self, actions: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:
@@ -104,12 +100,10 @@ class Conversion:
             return targets
         targets[:, _ARM], ik = 0, _arm_ik(self.robot)
         for target, action, state in zip(targets, actions, states, strict=True):
-            position, rotation = ik.ee_pose(self._to_radians(state[_ARM]))
-            wanted, turned = ik.ee_pose(self._to_radians(action[_ARM]))
-            target[_POSITION], target[_ROTATION] = (
-                wanted - position,
-                rotation_vector(turned @ rotation.T),
-            )
+            position, rotation = ik.ee_pose(state[_ARM].astype(np.float64))
+            wanted, turned = ik.ee_pose(action[_ARM].astype(np.float64))
+            target[_POSITION] = wanted - position
+            target[_ROTATION] = rotation_vector(turned @ rotation.T)
         return targets
 
     def decode(self, targets: NDArray[Any], states: NDArray[Any]) -> NDArray[Any]:
@@ -124,25 +118,14 @@ class Conversion:
             joints = self._joints(targets.shape[1])
             actions[:, joints] += states[:, joints]
             return actions
+        joints = states[:, _ARM].astype(np.float64)
         motions = targets[:, :_POSE].astype(np.float64)
-        joints = _arm_ik(self.robot).moved(self._to_radians(states[:, _ARM]), motions)
-        actions[:, _ARM] = np.degrees(joints) if self._robot.lerobot is not None else joints
+        actions[:, _ARM] = _arm_ik(self.robot).moved(joints, motions)
         return actions
 
     def _joints(self, n: int) -> NDArray[np.intp]:
         """Return the indices of the joints in an action of n numbers."""
         return np.delete(np.arange(n), self.grippers)
-
-    def _to_radians(self, joints: NDArray[Any]) -> F64:
-        """Return the joints (..., n - 1) [rad] of actions or states, in double precision."""
-        in_degrees = self._robot.lerobot is not None
-        return (
-            np.radians(joints, dtype=np.float64) if in_degrees else np.asarray(joints, np.float64)
-        )
-
-    @property
-    def _robot(self) -> Robot:
-        return get_robot(self.robot)
 
 
 def conversion_for(
@@ -169,7 +152,7 @@ def conversion_for(
         raise MismatchError(
             "meaning of the action", "the dataset", spec.action_meaning, space, needed
         )
-    if space == EE_DELTA and (names := found._robot.joint_names) != spec.joint_names:
+    if space == EE_DELTA and (names := get_robot(spec.robot).joint_names) != spec.joint_names:
         raise MismatchError(
             "list of joint names", "the dataset", spec.joint_names, f"robot {spec.robot}", names
         )

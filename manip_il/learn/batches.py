@@ -4,9 +4,7 @@ While training, pictures can be cropped and recoloured at random.
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -51,12 +49,10 @@ class Order:
         if self._edges is not None:
             draws = np.random.default_rng([self.seed, step]).uniform(size=self.batch_size)
             return np.minimum(np.searchsorted(self._edges, draws, side="right"), self.rows - 1)
-        start, end = step * self.batch_size, (step + 1) * self.batch_size
-        epochs = [
-            (epoch, epoch * self.rows) for epoch in range(start // self.rows, -(-end // self.rows))
-        ]
+        drawn = np.arange(self.batch_size) + step * self.batch_size
+        epochs, places = np.divmod(drawn, self.rows)
         return np.concatenate(
-            [self._permutation(e)[max(start - first, 0) : end - first] for e, first in epochs]
+            [self._permutation(int(one))[places[epochs == one]] for one in np.unique(epochs)]
         )
 
     def _permutation(self, epoch: int) -> I64:
@@ -71,11 +67,6 @@ def to_float(pictures: Tensor) -> Tensor:
     loader.
     """
     return pictures.to(torch.float32).div_(255)
-
-
-def pictures_to_float(batch: dict[str, Any], cameras: Iterable[str]) -> dict[str, Any]:
-    """Return the batch with its uint8 pictures, (B, 3, H, W), as float32 in [0, 1]."""
-    return batch | {key: to_float(batch[key]) for key in cameras}
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ Find the policy in a `pretrained_model` folder, a checkpoint or a run.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from manip_il import checks
@@ -30,7 +32,7 @@ from manip_il.data.schema import (
     check_same_spec,
 )
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
-from manip_il.learn.names import ACTION_SPACES, JOINT_TARGET, MLP, OWN_SPACE, PLAIN
+from manip_il.learn.names import ACTION_SPACES, JOINT_TARGET, OWN_SPACE, PLAIN
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.worlds.contract import EnvironmentSpec
 
@@ -46,12 +48,9 @@ _STEPS = (  # registry names of LeRobot's default steps, and ours: they load not
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 MOST_VALUES = 10_000  # in one numeric input of a network, or in its action
+_IK_ROBOT = "robot of the inverse kinematics"
 # prefix of dummy cameras that LeRobot's language policies fill in themselves
-_PLACEHOLDER = "empty_camera_"
-_MLP_SHAPE = (  # options that define an mlp's architecture
-    *("width", "depth", "activation", "loss", "components", "bins", "sigma", "clamp", "scales"),
-    *("scaled", "grippers", "action_space"),
-)
+_PLACEHOLDER = IMAGES + "empty_camera_"
 
 
 @dataclass(frozen=True)
@@ -108,10 +107,8 @@ class Origin:
     def of(
         cls,
         spec: EnvironmentSpec,
-        fingerprint: Mapping[str, Any] | None = None,
-        options: Mapping[str, Any] | None = None,
-        observation: str = "state",
-        look: Mapping[str, Any] | None = None,
+        fingerprint: Mapping[str, Any] = MappingProxyType({}),
+        options: Mapping[str, Any] = MappingProxyType({}),
         **more: Any,
     ) -> Origin:
         """Return the origin of a policy trained on data of `spec`.
@@ -120,30 +117,21 @@ class Origin:
             spec: The specification of the training data.
             fingerprint: The fingerprint of the training data.
             options: The options of the fit.
-            observation: One of `OBSERVATIONS`. If it is `state`, cameras, picture size and lighting
-                are left out.
-            look: The lighting of the pictures, as arguments of `sim.look.Look`; None if unknown.
-            more: Other fields of `Origin`.
+            more: Other fields of `Origin`. Without pictures among the observations, cameras and
+                picture size are left out.
         """
-        pictured = observation != "state"
-        return cls(
-            **{name: getattr(spec, name) for name in ("task", *MUST_AGREE)},
-            fingerprint=dict(fingerprint or {}),
-            options=dict(options or {}),
-            observation=observation,
-            cameras=spec.cameras if pictured else (),
-            image_size=spec.image_size if pictured else (0, 0),
-            look=None if look is None or not pictured else dict(look),
-            **more,
-        )
+        pictured = more.get("observation", "state") != "state"
+        names = ("task", *MUST_AGREE, *(("cameras", "image_size") if pictured else ()))
+        same = {name: getattr(spec, name) for name in names}
+        return cls(**same, fingerprint=dict(fingerprint), options=dict(options), **more)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the content of `manip_il.json`."""
-        return {
-            name: value
-            for name, value in asdict(self).items()
-            if value or name not in ("object", "state_names")
+    def write(self, folder: Path) -> None:
+        """Write `manip_il.json` into a `pretrained_model` folder."""
+        optional = ("object", "state_names")
+        values = {
+            name: value for name, value in asdict(self).items() if value or name not in optional
         }
+        (folder / META_FILE).write_text(json.dumps(values, indent=2) + "\n")
 
     def check_fits(self, spec: EnvironmentSpec) -> None:
         """Raise `MismatchError` naming both sides unless states and actions mean the same as in
@@ -216,15 +204,8 @@ class Checkpoint:
             name: processor_steps(path / name) for name in PROCESSORS if (path / name).is_file()
         }
         with in_one_line(f"{path / CONFIG} has features that cannot be read"):
-            inputs, outputs = (
-                _features(config["input_features"]),
-                _features(config["output_features"]),
-            )
-            sizes = {
-                key.removeprefix(IMAGES): shape[1:]
-                for key, (kind, shape) in inputs.items()
-                if kind == "VISUAL"
-            }
+            inputs = _features(config["input_features"])
+            outputs = _features(config["output_features"])
             space, robot, grippers = _space(config, processors.get(PROCESSORS[1], []))
             return cls(
                 path,
@@ -236,9 +217,9 @@ class Checkpoint:
                     if kind in ("STATE", "ENV") and all(shape)
                 },
                 pictures={
-                    name: (height, width)
-                    for name, (height, width) in sizes.items()
-                    if not name.startswith(_PLACEHOLDER)
+                    key.removeprefix(IMAGES): (shape[1], shape[2])
+                    for key, (kind, shape) in inputs.items()
+                    if kind == "VISUAL" and not key.startswith(_PLACEHOLDER)
                 },
                 action=_size(ACTION, outputs[ACTION][1]),
                 space=space,
@@ -290,16 +271,6 @@ class Checkpoint:
         look = self.origin.look if self.origin else None
         return CameraConfig(names, *next(iter(self.pictures.values())), Look(**(look or {})))
 
-    @property
-    def mlp_options(self) -> dict[str, Any] | None:
-        """The options for building another mlp of this architecture.
-
-        None for another kind of policy.
-        """
-        if self.kind != MLP:
-            return None
-        return {name: self.config[name] for name in ("type", *_MLP_SHAPE)}
-
     def check_fits(self, spec: EnvironmentSpec) -> None:
         """Raise `MismatchError` naming both sides unless environments of `spec` have the
         policy's inputs and action.
@@ -308,16 +279,18 @@ class Checkpoint:
             self.origin.check_fits(spec)
         environment, joints = f"{spec.robot}/{spec.task}", len(spec.joint_names)
         has: dict[str, Any] = {
-            "robot of the inverse kinematics": spec.robot,
+            _IK_ROBOT: spec.robot,
             STATE: len(spec.observed_names),
             ACTION: joints,
+            ENVIRONMENT_STATE: len(spec.environment_state_names),
+            **dict.fromkeys(spec.image_keys, spec.image_size),
         }
-        has |= {ENVIRONMENT_STATE: len(spec.environment_state_names)} | dict.fromkeys(
-            spec.image_keys, spec.image_size
-        )
-        needs: dict[str, Any] = {**self.numbers, ACTION: self.action}
-        needs |= {IMAGES + camera: size for camera, size in self.pictures.items()}
-        needs |= {"robot of the inverse kinematics": self.robot} if self.robot else {}
+        needs: dict[str, Any] = {
+            **self.numbers,
+            ACTION: self.action,
+            **{IMAGES + camera: size for camera, size in self.pictures.items()},
+            **({_IK_ROBOT: self.robot} if self.robot else {}),
+        }
         for what, needed in needs.items():
             if has.get(what) != needed:
                 raise MismatchError(what, "the policy", needed, environment, has.get(what))
@@ -439,8 +412,10 @@ def processor_steps(path: Path) -> list[dict[str, Any]]:
         ]
 
 
-_PLACES = (".", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model")
-_NEWEST = ("checkpoints/*/pretrained_model", "round_*/policy/checkpoints/*/pretrained_model")
+_PLACES = (
+    *(".", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model"),
+    *("checkpoints/*/pretrained_model", "round_*/policy/checkpoints/*/pretrained_model"),
+)
 _REPO = re.compile(r"[A-Za-z0-9_][\w.-]*/[A-Za-z0-9_][\w.-]*")
 
 
@@ -452,10 +427,7 @@ def find_policy(path: Path) -> Path:
         UsageError: There is no policy.
     """
     for place in _PLACES:
-        if (path / place / "config.json").is_file():
-            return path / place
-    for place in _NEWEST:
-        if found := sorted(path.glob(f"{place}/config.json")):
+        if found := sorted(path.glob(f"{place}/{CONFIG}")):
             return found[-1].parent
     wanted = f"LeRobot's pretrained_model folder, or a run that holds one{hub_hint(path)}"
     raise UsageError(f"no policy in {path}; expected {wanted}")
@@ -484,11 +456,3 @@ def policy_folder(policy: Any) -> Path:
     takes.
     """
     return find_policy(Path(getattr(policy, "path", policy)).expanduser())
-
-
-def with_folder(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a fit's policy, with the `pretrained_model` folder that a `path`
-    among them leads to.
-    """
-    path = options.get("path")
-    return dict(options) if path is None else {**options, "path": str(policy_folder(path))}

@@ -17,13 +17,13 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, check_same_spec
+from manip_il.data.schema import ENVIRONMENT_STATE, STATE, check_same_spec
 from manip_il.errors import UsageError, shorten
 from manip_il.learn.checkpoint import MOST_VALUES
-from manip_il.learn.mlp import MLPConfig, MLPPolicy, labelled
+from manip_il.learn.mlp import MLPConfig, MLPPolicy, labelled, table_of
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
-from manip_il.learn.network import MLPNetwork, NetworkConfig, fit_statistics, perceptron
+from manip_il.learn.network import MLPNetwork, NetworkConfig, fit_statistics, inverse, perceptron
 from manip_il.learn.samples import Table
 from manip_il.option import bounded, option
 
@@ -141,8 +141,6 @@ class CNNPolicy(MLPPolicy):
         Bit-identical whatever the other rows are.
         """
         state = batch[STATE]
-        if len(state) == 0:
-            return torch.empty_like(state)
         # The last bits of a convolution depend on the batch size, so one row at a time. Half
         # precision is for training.
         with torch.autocast(state.device.type, enabled=False):
@@ -214,11 +212,7 @@ class CNNPolicy(MLPPolicy):
                     -config.clamp, config.clamp
                 )
                 parts.append(self.privileged(encoded))
-                varies = self.truth_scale > 0
-                deviation = torch.where(
-                    varies, 1.0 / self.truth_scale, torch.zeros_like(self.truth_scale)
-                )
-                around = self.truth_mean + deviation * parts[1]
+                around = self.truth_mean + inverse(self.truth_scale) * parts[1]
                 if config.states:
                     return torch.cat([batch[STATE], around], dim=-1)
             if around is not None and self.offsets:
@@ -229,12 +223,8 @@ class CNNPolicy(MLPPolicy):
         """Return a camera's pictures (B, 3, H, W) at the size used in training, reduced by
         averaging if larger.
         """
-        size = tuple((self.config.input_features or {})[key].shape[1:])
-        return (
-            batch[key]
-            if batch[key].shape[2:] == size
-            else interpolate(batch[key], size, mode="area")
-        )
+        pictures, size = batch[key], tuple((self.config.input_features or {})[key].shape[1:])
+        return pictures if pictures.shape[2:] == size else interpolate(pictures, size, mode="area")
 
     @override
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
@@ -313,9 +303,7 @@ class CNNPolicy(MLPPolicy):
         found, own = states.spec, pictures[0].spec
         also = () if UNKNOWN_TASK in (found.task, own.task) else ("task",)
         check_same_spec(str(states.root), found, str(pictures[0].root), own, also)
-        columns = states.columns([STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID])
-        columns[ENVIRONMENT_STATE] = columns[ENVIRONMENT_STATE].reshape(len(states), -1)
-        kept = [labelled(one, [STATE, ENVIRONMENT_STATE]) for one in (table, columns)]
+        kept = [labelled(one, [STATE, ENVIRONMENT_STATE]) for one in (table, table_of(states))]
         self._states = tuple(torch.cat(parts) for parts in zip(*kept, strict=True))
         self.model.learn_statistics(*self._states)
 

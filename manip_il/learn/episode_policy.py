@@ -14,7 +14,6 @@ row.
 
 import contextlib
 import copy
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -44,12 +43,6 @@ class _Episode:
     steps: int = 0
     seed: int = 0
     memory: Any = None
-
-    def begin_step(self) -> None:
-        """Count a step, and set its seed."""
-        sequence = np.random.SeedSequence([self.number, self.steps])
-        self.seed = int(sequence.generate_state(1, np.uint64)[0])
-        self.steps += 1
 
 
 class EpisodePolicy:
@@ -87,24 +80,20 @@ class EpisodePolicy:
         }
         running = [self._episodes[number] for number in episodes]
         for episode in running:
-            episode.begin_step()
+            sequence = np.random.SeedSequence([episode.number, episode.steps])
+            episode.seed = int(sequence.generate_state(1, np.uint64)[0])
+            episode.steps += 1
         # mixed precision if the policy was trained with it, as in lerobot-eval
-        half = (
-            torch.autocast(self._device.type)
-            if self.module.config.use_amp
-            else contextlib.nullcontext()
-        )
+        half = torch.autocast(self._device.type, enabled=self.module.config.use_amp)
         with in_one_line("the policy cannot act"), half:
             if self.module.config.type == "diffusion":
                 actions = self._after(self._planned(self._observed(batch, running), running))
             else:
-                rows = (
-                    {key: value[i : i + 1] for key, value in batch.items()}
-                    for i in range(len(running))
-                )
-                actions = torch.cat(
-                    [self._act_alone(*pair) for pair in zip(rows, running, strict=True)]
-                )
+                alone = [
+                    self._act_alone({key: value[i : i + 1] for key, value in batch.items()}, one)
+                    for i, one in enumerate(running)
+                ]
+                actions = torch.cat(alone)
         return actions.to("cpu", torch.float32)
 
     def begin(self, instructions: Mapping[int, str]) -> None:
@@ -129,17 +118,13 @@ class EpisodePolicy:
         batch = {key: value for key, value in observed.items() if isinstance(value, Tensor)}
         if images := policy.config.image_features:
             batch[OBS_IMAGES] = torch.stack([batch[key] for key in images], dim=-4)
-        waiting: dict[int, list[_Episode]] = defaultdict(list)
         for i, episode in enumerate(episodes):
             if episode.memory is None:
                 policy.reset()
                 episode.memory = policy._queues
             populate_queues(episode.memory, {key: value[i : i + 1] for key, value in batch.items()})
-            if not episode.memory[ACTION]:
-                waiting[episode.number % ROWS].append(episode)
-        while waiting:
-            self._plan({row: asked.pop(0) for row, asked in waiting.items()})
-            waiting = {row: asked for row, asked in waiting.items() if asked}
+        while waiting := [episode for episode in episodes if not episode.memory[ACTION]]:
+            self._plan({episode.number % ROWS: episode for episode in waiting})
         return torch.cat([episode.memory[ACTION].popleft() for episode in episodes])
 
     def _plan(self, block: Mapping[int, _Episode]) -> None:
@@ -147,10 +132,12 @@ class EpisodePolicy:
         policy: Any = self.module
         model, config = policy.diffusion, policy.config
         weight = next(model.parameters())
-        generators = [torch.Generator(weight.device) for _ in range(ROWS)]
+        generators = [
+            torch.Generator(weight.device).manual_seed(block[row].seed if row in block else 0)
+            for row in range(ROWS)
+        ]
         batch: dict[str, Tensor] = {}
         for row, episode in block.items():
-            generators[row].manual_seed(episode.seed)
             for key, past in episode.memory.items():
                 if key != ACTION:
                     asked = torch.stack(list(past), dim=1)

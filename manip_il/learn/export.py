@@ -1,13 +1,12 @@
 """Export of a policy to one file that runs without this package: ONNX, for onnxruntime and others.
 
 Its inputs are raw observations under LeRobot's names, its outputs absolute actions. Everything
-between, normalisation and clipping too, is in the file. Its metadata say what the names, shapes and
-units mean.
+between, normalisation and clipping too, is in the file. Its metadata say what the names and shapes
+mean.
 """
 
 import io
 import json
-import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,24 +18,19 @@ from torch import Tensor, nn
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError
-from manip_il.learn.action_spaces import LAST
 from manip_il.learn.batches import to_float
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.mdp import F32, Images
-from manip_il.worlds.contract import GRIPPERS, OPENINGS, SERVOS, TWO_ARMS
+from manip_il.worlds.contract import SERVOS
 
 # largest difference between the actions of the file and of the checkpoint [rad] or [m]
 TOLERANCE = 1e-5
 SERVO_TOLERANCE = 1e-3  # largest difference for robots in servos' units [degrees]
 _OPSET = 17
 _ROWS = 64  # observations on which the graph is traced, and file and checkpoint are compared
-# (joints, grippers)
-_JOINT_UNITS = {OPENINGS: ("rad", "m"), SERVOS: ("deg", "0 to 100"), TWO_ARMS: ("rad", "0 to 1")}
-_UNITS = {"x": "m", "y": "m", "z": "m", "width": "m", "tilt": "rad"}
-_UNITLESS = re.compile(r".*\.(axis_[xyz]\.[xyz]|cos[^.]*|sin[^.]*)")
 
 
 class PolicyFunction(nn.Module):
@@ -143,8 +137,8 @@ def metadata(checkpoint: Checkpoint, inputs: Sequence[str]) -> dict[str, str]:
             "robot": origin.robot,
             "task": origin.task,
             "action_meaning": origin.action_meaning,
+            "control_rate_hz": origin.fps,
         }
-        entries["control_rate_hz"] = origin.fps
     return {
         key: value if isinstance(value, str) else json.dumps(value)
         for key, value in entries.items()
@@ -152,35 +146,17 @@ def metadata(checkpoint: Checkpoint, inputs: Sequence[str]) -> dict[str, str]:
 
 
 def _entry(checkpoint: Checkpoint, key: str) -> dict[str, Any]:
-    """Return the name, type and shape of an input or output, and what its numbers mean, if
+    """Return the name, type and shape of an input or output, and the names of its numbers, if
     known.
     """
     if key.startswith(IMAGES):
         shape = ["batch", *checkpoint.pictures[key.removeprefix(IMAGES)], 3]
-        return {
-            "name": key,
-            "dtype": "uint8",
-            "shape": shape,
-            "names": ["red", "green", "blue"],
-            "units": "0 to 255",
-        }
+        return {"name": key, "dtype": "uint8", "shape": shape}
     size = checkpoint.action if key == ACTION else checkpoint.numbers[key]
     entry = {"name": key, "dtype": "float32", "shape": ["batch", size]}
-    origin = checkpoint.origin
-    if origin is None:
-        return entry
-    if key == ENVIRONMENT_STATE:
-        names = list(origin.environment_state_names)
-        units = [
-            "1" if _UNITLESS.fullmatch(name) else _UNITS.get(name.rpartition(".")[2])
-            for name in names
-        ]
-        return entry | {"names": names, "units": units}
-    entry["names"] = list(origin.joint_names)
-    meaning = origin.action_meaning
-    if meaning in _JOINT_UNITS:
-        grippers = [place % size for place in GRIPPERS.get(meaning, LAST)]
-        entry["units"] = [_JOINT_UNITS[meaning][place in grippers] for place in range(size)]
+    if origin := checkpoint.origin:
+        ours = origin.environment_state_names if key == ENVIRONMENT_STATE else origin.joint_names
+        entry["names"] = list(ours)
     return entry
 
 

@@ -44,15 +44,15 @@ class FitConfig:
     """Options of a fit; None means the default of the policy's type.
 
     Attributes:
-        policy: `type` or `path`, and the options of that policy (`loss`, `width`, `chunk_size`,
-            ...).
+        policy: `type` or `path` (of a checkpoint or a run), and the options of that policy
+            (`loss`, `width`, `chunk_size`, ...).
         action_space: See `manip_il.learn.action_spaces`; by default that of the initial checkpoint,
             if there is one.
         threads: With a second thread a fit is up to 1.8 times as fast if a core is free, and tens
             of times slower if none is.
         trust: Whether models that the policy or its checkpoint names may be loaded.
         seed: For weights and batches.
-        init_from: A `pretrained_model` folder with the initial weights.
+        init_from: A checkpoint with the initial weights.
 
     Raises:
         UsageError: A number is out of range, or options do not go together.
@@ -136,7 +136,7 @@ class FitConfig:
         Raises:
             ManipError: The checkpoint cannot be read.
         """
-        return _open(Path(self.policy["path"])) if "path" in self.policy else None
+        return _open(self.policy["path"]) if "path" in self.policy else None
 
     @cached_property
     def initial(self) -> Checkpoint | None:
@@ -184,7 +184,7 @@ class FitConfig:
         return self.steps or self.defaults.steps
 
 
-def _open(path: Path) -> Checkpoint:
-    from manip_il.learn.checkpoint import Checkpoint  # which imports numpy
+def _open(path: Path | str) -> Checkpoint:
+    from manip_il.learn.checkpoint import Checkpoint, policy_folder  # which imports numpy
 
-    return Checkpoint.open(path)
+    return Checkpoint.open(policy_folder(path))

@@ -11,7 +11,7 @@ from typing import Any
 
 import draccus
 import torch
-from draccus.utils import DecodingError, ParsingError
+from draccus.utils import DecodingError
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.configs.default import DatasetConfig, WandBConfig
 from lerobot.configs.train import TrainPipelineConfig
@@ -133,14 +133,7 @@ def decode(cls: type[Any], settings: Mapping[str, Any], source: str) -> Any:
             raise UnknownName(f"option of {source}:", name, known)
     try:
         return draccus.decode(cls, dict(settings))
-    except (
-        DecodingError,
-        ParsingError,
-        ValueError,
-        TypeError,
-        NotImplementedError,
-        ImportError,
-    ) as error:
+    except Exception as error:
         reason = error if isinstance(error, DecodingError) else error.__cause__ or error
         raise UsageError(f"{source}: {' '.join(str(reason).split())}") from error
 
@@ -170,9 +163,6 @@ def policy_features(
     Pictures, (H, W, 3) in `info.json`, are (3, H, W) for a policy.
     """
     typed = dataset_to_policy_features({key: features[key] for key in (*inputs, ACTION)})
-    typed = {
-        key: PolicyFeature(feature.type, tuple(feature.shape)) for key, feature in typed.items()
-    }
     return {key: typed[key] for key in inputs}, {ACTION: typed[ACTION]}
 
 

@@ -25,16 +25,17 @@ _LEAST_SIGMA = 0.1  # least smearing of a target [bins]
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
-class Head:
+class Head(nn.Module):
     """A family of action distributions.
 
     Attributes:
         n: Numbers in an action.
-        size: Parameters per row.
+        size: Parameters per row, by default n.
     """
 
-    n: int
-    size: int
+    def __init__(self, n: int, size: int | None = None) -> None:
+        super().__init__()
+        self.n, self.size = n, size or n
 
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
         """Return the loss of each row, (B,), from params (B, size) and target (B, n)."""
@@ -48,15 +49,12 @@ class Head:
 class MSEHead(Head):
     """Mean squared error: a Gaussian with unit variance, up to constants. Acts with its mean."""
 
-    def __init__(self, n: int) -> None:
-        self.n = self.size = n
-
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
         return (params - target).square().mean(-1)
 
 
-class L1Head(MSEHead):
+class L1Head(Head):
     """Mean absolute error: a Laplace distribution with unit scale, up to constants.
 
     Acts with its median.
@@ -67,7 +65,7 @@ class L1Head(MSEHead):
         return (params - target).abs().mean(-1)
 
 
-class GaussianHead(Head, nn.Module):
+class GaussianHead(Head):
     """Diagonal Gaussian: the network gives the mean; one log-deviation per dimension is learnt.
 
     Acts with the mean.
@@ -79,8 +77,7 @@ class GaussianHead(Head, nn.Module):
     """
 
     def __init__(self, n: int) -> None:
-        super().__init__()
-        self.n = self.size = n
+        super().__init__(n)
         self.raw_log_std = nn.Parameter(torch.zeros(n))
 
     @override
@@ -100,9 +97,8 @@ class MixtureHead(Head):
     """
 
     def __init__(self, n: int, components: int) -> None:
-        self.n = n
+        super().__init__(n, components * (1 + 2 * n))
         self.components = components
-        self.size = components * (1 + 2 * n)
 
     def split(self, params: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return log-weights (B, K), means (B, K, n), log-deviations (B, K, n)."""
@@ -144,12 +140,12 @@ class CategoricalHead(Head):
     """
 
     def __init__(self, n: int, bins: int, sigma: float) -> None:
-        self.n = n
-        self.bins = bins
+        pad = math.ceil(_REACH * sigma)
+        total = bins + 2 * pad
+        super().__init__(n, n * total)
+        self.bins, self.pad = bins, pad
+        self.total = total
         self.sigma = max(sigma, _LEAST_SIGMA)
-        self.pad = math.ceil(_REACH * sigma)
-        self.total = bins + 2 * self.pad
-        self.size = n * self.total
 
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
@@ -192,14 +188,11 @@ def make_head(loss: str, n: int, *, components: int, bins: int, sigma: float) ->
         bins: Bins per dimension in `categorical`.
         sigma: Standard deviation of a smeared target in `categorical` [bins].
     """
-    heads: dict[str, Head] = {
-        "mse": MSEHead(n),
-        "l1": L1Head(n),
-        "gaussian": GaussianHead(n),
-        "mixture": MixtureHead(n, components),
-        "categorical": CategoricalHead(n, bins, sigma),
-    }
-    return heads[loss]
+    if loss == "mixture":
+        return MixtureHead(n, components)
+    if loss == "categorical":
+        return CategoricalHead(n, bins, sigma)
+    return {"mse": MSEHead, "l1": L1Head, "gaussian": GaussianHead}[loss](n)
 
 
 def floored_log_std(raw: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, override
 
+import numpy as np
 import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig
@@ -23,7 +24,7 @@ from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork, NetworkConfig
-from manip_il.learn.samples import Table, valid_frames
+from manip_il.learn.samples import Table, label_valid
 
 __path__: list[str] = []
 
@@ -85,11 +86,11 @@ class MLPConfig(NetworkConfig, PreTrainedConfig):
         relative.
         """
         state, action = self.robot_state_feature, self.action_feature
-        shapes = [None if feature is None else feature.shape for feature in (state, action)]
-        if None in shapes or (self.action_space == JOINT_DELTA and shapes[0] != shapes[1]):
+        is_relative = self.action_space == JOINT_DELTA
+        if not state or not action or (is_relative and state.shape != action.shape):
             raise UsageError(
                 f"the {self.type} policy needs observation.state and action, of the same size in"
-                f" the action space {JOINT_DELTA}; their shapes are {shapes[0]} and {shapes[1]}"
+                f" the action space {JOINT_DELTA}; they are {state} and {action}"
             )
 
     @override
@@ -201,25 +202,24 @@ def training_table(config: MLPConfig, dataset_meta: Any) -> Table:
             f"{EE_DELTA} needs the robot's kinematics, which LeRobot does not have; train with"
             " manip-il train"
         )
-    names = [
-        key
-        for key in (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)
-        if key in dataset_meta.features
-    ]
-    columns = Dataset.open(dataset_meta.root).columns(names)
-    return {key: column.reshape(len(column), -1) for key, column in columns.items()}
+    return table_of(Dataset.open(dataset_meta.root))
+
+
+def table_of(dataset: Dataset) -> Table:
+    """Return what an mlp learns from, by column, (N, d) each, and `label_valid`, (N,)."""
+    names = [key for key in (STATE, ENVIRONMENT_STATE, ACTION) if key in dataset.features]
+    columns = dataset.columns(names)
+    table = {key: column.reshape(len(column), -1) for key, column in columns.items()}
+    return table | {LABEL_VALID: label_valid(dataset)}
 
 
 def labelled(table: Table, inputs: Sequence[str]) -> tuple[Tensor, Tensor]:
     """Return the joined columns `inputs`, (S, d), and the actions, (S, n), of the frames with a
     valid label.
     """
-    valid = torch.from_numpy(valid_frames(table))
-    seen, actions = (
-        torch.cat([torch.from_numpy(table[key])[valid] for key in keys], dim=1).float()
-        for keys in (inputs, [ACTION])
-    )
-    return seen, actions
+    valid = table[LABEL_VALID] != 0
+    seen = np.concatenate([table[key][valid] for key in inputs], axis=1)
+    return torch.from_numpy(seen).float(), torch.from_numpy(table[ACTION][valid]).float()
 
 
 def offsets_of(features: Mapping[str, Any]) -> tuple[int, ...]:

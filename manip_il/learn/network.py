@@ -128,8 +128,14 @@ def fit_statistics(inputs: F32, targets: F32, loss: str) -> Statistics:
     input_scale = np.where(
         deviation < CONSTANT_INPUT, 0.0, 1.0 / np.maximum(deviation, CONSTANT_INPUT)
     )
-    found = {"input_mean": input_mean, "input_scale": input_scale, "target_mean": target_mean}
-    found |= {"target_scale": target_scale, "target_low": low, "target_high": high}
+    found = {
+        "input_mean": input_mean,
+        "input_scale": input_scale,
+        "target_mean": target_mean,
+        "target_scale": target_scale,
+        "target_low": low,
+        "target_high": high,
+    }
     return {name: torch.from_numpy(values.astype(np.float32)) for name, values in found.items()}
 
 
@@ -137,6 +143,11 @@ def _mean_and_deviation(values: F32) -> tuple[F64, F64]:
     """Return mean and standard deviation of each column."""
     mean = values.mean(0, dtype=np.float64)
     return mean, np.sqrt(np.square(values - mean).mean(0))
+
+
+def inverse(scale: Tensor) -> Tensor:
+    """Return 1 / scale, (n,), and 0 for a scale of 0."""
+    return torch.where(scale > 0, 1.0 / scale, torch.zeros_like(scale))
 
 
 def perceptron(
@@ -239,10 +250,7 @@ class MLPNetwork(nn.Module):
 
         0 for a target with scale 0.
         """
-        inverse = torch.where(
-            self.target_scale > 0, 1.0 / self.target_scale, torch.zeros_like(self.target_scale)
-        )
-        return (targets - self.target_mean) * inverse
+        return (targets - self.target_mean) * inverse(self.target_scale)
 
     def row_losses(self, inputs: Tensor, actions: Tensor) -> Tensor:
         """Return the loss of each row, (B,), for raw inputs (B, n + k) and absolute actions (B,
@@ -339,10 +347,8 @@ def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
     # offset
     first = network.layers[0]
     assert isinstance(first, torch.nn.Linear)
-    offset, scale = (
-        (kept["input_mean"] - network.input_mean) * network.input_scale,
-        kept["input_scale"],
-    )
+    scale = kept["input_scale"]
+    offset = (kept["input_mean"] - network.input_mean) * network.input_scale
     first.bias.add_(first.weight @ offset)
     first.weight.mul_(torch.where(scale > 0, network.input_scale / scale, torch.zeros_like(scale)))
     network.set_statistics(kept)

@@ -109,7 +109,13 @@ class LearnedPolicy:
         """
         if not len(states):
             return np.empty((0, self.checkpoint.action))
-        batch = self._numbers(states, environment_states) | self._pictures(images or {})
+        numbers = {STATE: states, ENVIRONMENT_STATE: environment_states}
+        batch = {
+            key: torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+            for key, values in numbers.items()
+            if key in self.checkpoint.numbers
+        }
+        batch |= self._pictures(images or {})
         with threads(1):
             actions = self._policy.select(
                 batch, range(len(states)) if episodes is None else episodes
@@ -128,14 +134,6 @@ class LearnedPolicy:
                 means the `task` given to `load`.
         """
         self._policy.begin(instructions)
-
-    def _numbers(self, states: F32, environment_states: F32) -> Batch:
-        given = {STATE: states, ENVIRONMENT_STATE: environment_states}
-        return {
-            key: torch.from_numpy(np.ascontiguousarray(given[key], dtype=np.float32))
-            for key in given
-            if key in self.checkpoint.numbers
-        }
 
     def _pictures(self, images: Images) -> Batch:
         """Return pictures as in LeRobot's evaluation: float32 (B, 3, H, W), from 0 to 1."""
@@ -191,7 +189,7 @@ class _Perceptron:
         self.module.to(device).eval()
         # the network converts joint_delta
         space = checkpoint.space if checkpoint.space == EE_DELTA else JOINT_TARGET
-        self._conversion = Conversion(space, checkpoint.robot)
+        self._decode = Conversion(space, checkpoint.robot).decode
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action per row, (B, n).
@@ -200,12 +198,8 @@ class _Perceptron:
         action space.
         """
         inputs = torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)
-        targets = self.module.act(inputs)
-        if self._conversion.space == JOINT_TARGET:
-            return targets
-        return torch.from_numpy(
-            self._conversion.decode(targets.cpu().numpy(), batch[STATE].numpy())
-        )
+        targets = self.module.act(inputs).cpu().numpy()
+        return torch.from_numpy(self._decode(targets, batch[STATE].numpy()))
 
     def begin(self, instructions: Mapping[int, str]) -> None:
         """Do nothing: the mlp has no memory, and does not read language."""

@@ -5,7 +5,7 @@ A sample may include frames around its own, its window, which LeRobot's policies
 `<column>_is_pad` marks them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +22,7 @@ from manip_il.data.lerobot_layout import EPISODE_INDEX, FRAME_INDEX, INDEX, TASK
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics
 from manip_il.errors import ManipError, MismatchError
+from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import in_one_line
 from manip_il.mdp import F64, I64, require_finite
 
@@ -93,21 +94,6 @@ class Windows:
         return samples
 
 
-def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) -> Windows:
-    """Return the windows of a policy's training samples.
-
-    Args:
-        policy: The policy's options, which define the offsets.
-        columns: The columns that the policy observes, and the action.
-        episodes: The episode of every frame, (N,), ascending.
-    """
-    actions, observations = policy.action_delta_indices, policy.observation_delta_indices
-    wanted = {key: actions if key == ACTION else observations for key in columns}
-    return Windows(
-        episodes, {key: np.asarray(one, np.int64) for key, one in wanted.items() if one is not None}
-    )
-
-
 @dataclass(frozen=True)
 class Samples:
     """Samples in memory; a batch is one gather per column.
@@ -148,7 +134,7 @@ def load_data(
     *,
     eval_split: float,
     seed: int,
-    encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]] | None = None,
+    conversion: Conversion | None = None,
     on_frames: Callable[[int], None] | None = None,
 ) -> Samples:
     """Return the samples of the concatenated datasets.
@@ -159,8 +145,7 @@ def load_data(
             encoded actions.
         eval_split: Share of the episodes that are held out.
         seed: Decides which episodes are held out.
-        encode: Maps actions (N, n) and states (N, n) to targets; None if the targets are the
-            datasets' actions.
+        conversion: Converts actions to targets; None if the targets are the datasets' actions.
         on_frames: Called with the number of newly decoded frames.
 
     Raises:
@@ -174,19 +159,23 @@ def load_data(
     cameras = [key for key in features if key in meta.camera_keys]
     numbers = [key for key in features if key not in cameras]
     table = joined_columns(meta.datasets, [*numbers, *_ALWAYS])
-    table[LABEL_VALID] = np.concatenate([_label_valid(dataset) for dataset in meta.datasets])
+    table[LABEL_VALID] = np.concatenate([label_valid(dataset) for dataset in meta.datasets])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     for key in numbers:
         # a column with one number per frame becomes a vector, too
         table[key] = table[key].reshape(len(table[key]), -1)
         require_finite(f"column {key}", table[key])
-    if encode is not None:
-        table[ACTION] = encode(table[ACTION].astype(np.float32), table[STATE])
+    if conversion is not None:
+        table[ACTION] = conversion.encode(table[ACTION].astype(np.float32), table[STATE])
         meta.stats |= column_statistics({ACTION: table[ACTION]})
     meta.table = table
     episodes = table[EPISODE_INDEX].astype(np.int64)
-    windows = windows_of(policy, features, episodes)
-    usable = windows.usable(valid_frames(table), getattr(policy, "drop_n_last_frames", 0))
+    deltas = dict.fromkeys(features, policy.observation_delta_indices)
+    deltas[ACTION] = policy.action_delta_indices
+    windows = Windows(
+        episodes, {key: np.asarray(one, np.int64) for key, one in deltas.items() if one is not None}
+    )
+    usable = windows.usable(table[LABEL_VALID] != 0, getattr(policy, "drop_n_last_frames", 0))
     train, held_out = split_by_episode(episodes[usable], eval_split, seed)
     if len(held_out) > _MAX_HELD_OUT:
         held_out = held_out[np.linspace(0, len(held_out) - 1, _MAX_HELD_OUT).astype(np.int64)]
@@ -203,21 +192,13 @@ def load_data(
     )
 
 
-def _label_valid(dataset: Dataset) -> NDArray[Any]:
-    """Return a dataset's `label_valid`, (N,): 1 without such a column."""
+def label_valid(dataset: Dataset) -> NDArray[Any]:
+    """Return a dataset's `label_valid`, (N,), which says whether a frame counts in the loss: 1
+    without such a column.
+    """
     if LABEL_VALID not in dataset.features:
         return np.ones(len(dataset), np.int64)
     return dataset.columns([LABEL_VALID])[LABEL_VALID].reshape(-1)
-
-
-def valid_frames(table: Table) -> NDArray[np.bool_]:
-    """Return whether each frame counts in the loss, (N,), by its `label_valid`.
-
-    All count without such a column.
-    """
-    if LABEL_VALID not in table:
-        return np.ones(len(table[ACTION]), dtype=bool)
-    return np.asarray(table[LABEL_VALID]).reshape(-1) != 0
 
 
 def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I64]:
@@ -232,12 +213,9 @@ def split_by_episode(episodes: I64, fraction: float, seed: int) -> tuple[I64, I6
     Returns:
         Row numbers to train on, (N - h,), and to hold out, (h,), both ascending.
     """
-    names = np.unique(episodes)
+    names = np.random.default_rng([seed, 1]).permutation(np.unique(episodes))
     count = round(fraction * len(names))
-    if not 0 < count < len(names):
-        return np.arange(len(episodes)), np.arange(0)
-    held_out = np.random.default_rng([seed, 1]).permutation(names)[:count]
-    mask = np.isin(episodes, held_out)
+    mask = np.isin(episodes, names[: count % len(names)])
     return np.flatnonzero(~mask), np.flatnonzero(mask)
 
 

@@ -4,6 +4,7 @@ Normalisation statistics cover the frames of all datasets, each counted once, wh
 The weights can thus change without changing the units in which a policy observes and acts.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.info import Info
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, check_same_spec
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import MLP
 from manip_il.mdp import F64, I64
@@ -37,14 +38,23 @@ def row_weights(datasets: Sequence[Dataset], shares: Sequence[float], rows: I64)
     return np.asarray(shares)[which] / np.bincount(which)[which]
 
 
+def check_shares(shares: Sequence[float], datasets: Sequence[Dataset]) -> None:
+    """Raise `UsageError` unless there are no shares, or a positive one for each dataset."""
+    wrong = len(shares) != len(datasets) or not all(0 < share < math.inf for share in shares)
+    if shares and wrong:
+        raise UsageError(
+            f"the weights of {len(datasets)} datasets are {list(shares)}; expected a number above"
+            " 0 for each"
+        )
+
+
 def check_same_sources(
-    roots: Sequence[Path], specs: Sequence[EnvironmentSpec], *, pictures: bool, language: bool
+    specs: Mapping[Any, EnvironmentSpec], *, pictures: bool, language: bool
 ) -> None:
     """Raise `MismatchError` unless several datasets can be used as one.
 
     Args:
-        roots: The folders of the datasets, for the message.
-        specs: The specifications of the datasets.
+        specs: The specifications of the datasets by their folders, which the message names.
         pictures: Whether the policy takes pictures, so that cameras and sizes must agree, too.
         language: Whether the policy reads an instruction; if not, the task must be the same.
 
@@ -52,12 +62,13 @@ def check_same_sources(
         MismatchError: A dataset differs from the first; the message names both.
     """
     what = (*(("cameras", "image_size") if pictures else ()), *(() if language else ("task",)))
-    for root, spec in zip(roots[1:], specs[1:], strict=True):
-        check_same_spec(str(roots[0]), specs[0], str(root), spec)
+    (first, spec), *others = specs.items()
+    for root, other in others:
+        check_same_spec(str(first), spec, str(root), other)
         for name in what:
-            left, right = getattr(specs[0], name), getattr(spec, name)
+            left, right = getattr(spec, name), getattr(other, name)
             if left != right and UNKNOWN_TASK not in (left, right):
-                raise MismatchError(name, str(roots[0]), left, str(root), right)
+                raise MismatchError(name, str(first), left, str(root), right)
 
 
 def input_columns(config: FitConfig, root: Path, info: Info) -> list[str]:

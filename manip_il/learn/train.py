@@ -7,13 +7,11 @@ step.
 Train a policy on datasets: behaviour cloning.
 """
 
-import contextlib
-import copy
 import math
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -32,26 +30,30 @@ from lerobot.utils.random_utils import set_seed
 
 from manip_il.data.atomic import output_of, require_ours
 from manip_il.data.dataset import Dataset, JoinedDatasets
+from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import NotFiniteError, UsageError
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
-from manip_il.learn.batches import Augment, Order, generator_of, pictures_to_float
-from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line, with_folder
+from manip_il.learn.batches import Augment, Order, generator_of, to_float
+from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options, policy_config, set_features
 from manip_il.learn.lerobot_policy import build_policy, build_processors, load_processors
 from manip_il.learn.names import OWN_SPACE, PLAIN
 from manip_il.learn.network import threads
 from manip_il.learn.samples import Batch, Samples, load_data, rabc_weights
-from manip_il.learn.sources import check_same_sources, input_columns, recorded_look, row_weights
+from manip_il.learn.sources import (
+    check_same_sources,
+    check_shares,
+    input_columns,
+    recorded_look,
+    row_weights,
+)
 from manip_il.learn.training_state import (
     PRETRAINED_MODEL,
-    Writer,
     last_checkpoint,
     metric_writers,
     new_checkpoint,
-    read_step,
-    write_own_files,
 )
 from manip_il.mdp import F64, I64
 from manip_il.option import make_options
@@ -102,14 +104,11 @@ class Trainer:
         self.config = config
         self.output_dir = output_dir
         self.datasets = datasets
-        roots, specs = (
-            [dataset.root for dataset in datasets],
-            [dataset.spec for dataset in datasets],
-        )
-        check_same_sources(
-            roots, specs, pictures=config.takes_images, language=config.kind not in PLAIN
-        )
-        spec = specs[0]
+        specs = {dataset.root: dataset.spec for dataset in datasets}
+        language = config.kind not in PLAIN
+        check_same_sources(specs, pictures=config.takes_images, language=language)
+        check_shares(shares, datasets)
+        spec = datasets[0].spec
         self.pipeline: Any  # LeRobot's options
         self.pipeline, space = lerobot_options(config, spec.action_meaning)
         columns = input_columns(config, datasets[0].root, datasets[0].info)
@@ -150,7 +149,7 @@ class Trainer:
             self.meta,
             eval_split=config.eval_split,
             seed=config.seed,
-            encode=self.encoder.encode if self.encoder else None,
+            conversion=self.encoder,
             on_frames=on_frames,
         )
 
@@ -171,15 +170,13 @@ class Trainer:
     def describe(self, shares: Sequence[float]) -> Origin:
         """Return what a checkpoint stores about its training."""
         first = self.datasets[0]
+        augment = asdict(self._augment) if self._augment else None
         return Origin.of(
             first.spec,
             first.fingerprint,
-            {
-                "eval_split": self.config.eval_split,
-                "augment": asdict(self._augment) if self._augment else None,
-            },
-            self.config.observes,
-            recorded_look(first.provenance, first.fingerprint),
+            {"eval_split": self.config.eval_split, "augment": augment},
+            observation=self.config.observes,
+            look=recorded_look(first.provenance, first.fingerprint),
             datasets=[
                 {"name": dataset.root.resolve().name, "frames": len(dataset), "weight": share}
                 for dataset, share in zip(self.datasets, shares or repeat(None), strict=False)
@@ -225,13 +222,11 @@ class Trainer:
         Raises:
             NotFiniteError: The loss is not finite.
         """
-        self.pipeline.output_dir = self.output_dir
-        metrics = contextlib.nullcontext(list[Writer]())
+        writers = []
         if self.accelerator.is_main_process:
-            metrics = metric_writers(
-                self.output_dir, self.step, self.config.tensorboard, self.pipeline
-            )
-        with threads(self.config.threads), metrics as writers:
+            curves = self.config.tensorboard
+            writers = metric_writers(self.output_dir, self.step, curves, self.pipeline)
+        with threads(self.config.threads):
             for record in self.run():
                 for write in writers if record else []:
                     write(record)
@@ -277,7 +272,7 @@ class Trainer:
         update_policy(
             metrics,
             self.policy,
-            self.preprocessor(self._augmented(self.batch(self.step))),
+            self._prepared(self.batch(self.step), self._augment),
             self.optimizer,
             self.pipeline.optimizer.grad_clip_norm,
             self.accelerator,
@@ -297,57 +292,58 @@ class Trainer:
         return self.data.batch(self.data.train[rows])
 
     def validate(self) -> dict[str, float]:
-        """Return the mean loss on samples of held-out episodes, without changing the random state
-        of training.
-
-        Also returns the other numbers that the policy outputs, such as the parts of its loss.
+        """Return the mean loss on samples of held-out episodes, if there are any, without changing
+        the random state of training.
         """
         held_out, size = self.data.held_out, self.pipeline.batch_size
         policy = self.unwrapped
         policy.eval()
-        sums = defaultdict[str, float](float)
+        total = 0.0
         with torch.no_grad(), torch.random.fork_rng(), self.accelerator.autocast():
             # policies that sample (diffusion) draw the same every time
             torch.manual_seed(self.config.seed)
             for start in range(0, len(held_out), size):
                 rows: I64 = held_out[start : start + size]
-                batch = pictures_to_float(self.data.batch(rows), self.data.pictures)
-                loss, outputs = policy.forward(self.preprocessor(batch))
-                for name, value in {**(outputs or {}), "loss": loss.item()}.items():
-                    if isinstance(value, int | float):
-                        sums[f"val_{name}"] += value * len(rows) / len(held_out)
-        return dict(sums)
+                loss, _ = policy.forward(self._prepared(self.data.batch(rows)))
+                total += loss.item() * len(rows)
+        return {"val_loss": total / len(held_out)} if len(held_out) else {}
 
     def save(self) -> None:
         """Write a checkpoint of this step and make it the last one."""
         if self.accelerator.is_main_process:
-            pipeline = copy.copy(self.pipeline)
-            pipeline.output_dir = _portable(self.output_dir)
-            with new_checkpoint(
-                get_step_checkpoint_dir(self.output_dir, pipeline.steps, self.step)
-            ) as new:
-                state, processors = (
-                    (self.optimizer, self.scheduler),
-                    (self.preprocessor, self.postprocessor),
+            steps = self.pipeline.steps
+            self.pipeline.output_dir = _portable(self.output_dir)
+            with new_checkpoint(get_step_checkpoint_dir(self.output_dir, steps, self.step)) as new:
+                save_checkpoint(
+                    new,
+                    self.step,
+                    self.pipeline,
+                    self.unwrapped,
+                    self.optimizer,
+                    self.scheduler,
+                    self.preprocessor,
+                    self.postprocessor,
+                    batch_size=self.pipeline.batch_size,
                 )
-                save_checkpoint(new, self.step, pipeline, self.unwrapped, *state, *processors)
-                write_own_files(
-                    new, self.origin, read_step(new) | {"batch_size": pipeline.batch_size}
-                )
+                self.origin.write(new / PRETRAINED_MODEL)
         self.accelerator.wait_for_everyone()
 
-    def _augmented(self, batch: Batch) -> Batch:
-        """Move pictures to the device, shifted and recoloured by draws that depend only on seed,
+    def _prepared(self, batch: Batch, augment: Augment | None = None) -> Batch:
+        """Return what the policy reads of a batch.
+
+        With `augment`, its pictures are shifted and recoloured by draws that depend only on seed,
         step and process.
         """
-        cameras, augment = self.data.pictures, self._augment
-        batch = batch | {
-            key: batch[key].to(self.accelerator.device, non_blocking=True) for key in cameras
+        convert = to_float
+        if augment is not None:
+            key = self.config.seed, self.step, self.accelerator.process_index
+            convert = partial(augment, generator=generator_of(*key))
+        device = self.accelerator.device
+        pictures = {
+            camera: convert(batch[camera].to(device, non_blocking=True))
+            for camera in self.data.pictures
         }
-        if augment is None:
-            return pictures_to_float(batch, cameras)
-        generator = generator_of(self.config.seed, self.step, self.accelerator.process_index)
-        return batch | {camera: augment(batch[camera], generator) for camera in cameras}
+        return self.preprocessor(batch | pictures)
 
 
 def _portable(path: Path) -> Path:
@@ -374,17 +370,11 @@ def _accelerator(policy: PreTrainedConfig) -> Accelerator:
     if not torch.distributed.is_initialized():
         state: Any = AcceleratorState
         state._reset_state(reset_partial_state=True)
-    # every process has equal buffers, except for the cnn's mean error
-    ours = policy.type in OWN_SPACE
     return Accelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,
         cpu=policy.device == "cpu",
-        kwargs_handlers=[
-            DistributedDataParallelKwargs(
-                find_unused_parameters=not ours, broadcast_buffers=not ours
-            )
-        ],
+        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
     )
 
 
@@ -423,14 +413,21 @@ def train(
     """
     progress = progress or Progress()
     given = (datasets,) if isinstance(datasets, Data) else datasets
+    if not given:
+        raise UsageError("no dataset was given to train on")
     folder = Path(output_dir).expanduser()
     require_ours(folder, output_of("Train"))
     opened = [
         one if isinstance(one, Dataset) else Dataset.open(Path(one).expanduser()) for one in given
     ]
-    options["policy"] = with_folder(options.get("policy", {}))
     config = make_options(FitConfig, seed=stream_base("training", seed), **options)
-    drawn = None if weights is None else _frame_weights(weights, opened, config)
+    if weights is not None and (shares or len(opened) > 1):
+        raise UsageError("weights are for the frames of one dataset; give it alone, without shares")
+    drawn = None
+    if weights is not None:
+        ahead = getattr(policy_config(config), "chunk_size", None) or round(opened[0].fps)
+        episodes = opened[0].columns([EPISODE_INDEX])[EPISODE_INDEX].astype("int64")
+        drawn = rabc_weights(weights, episodes, ahead)
     pictures = sum(len(one) * len(one.cameras) for one in opened) if config.takes_images else 0
     progress.start("decode pictures, once", pictures)
     trainer = Trainer(
@@ -447,12 +444,3 @@ def train(
         f"train {config.kind} on {len(trainer.data.train):,} samples", config.total_steps
     )
     return Checkpoint.open(trainer.fit(progress.log))
-
-
-def _frame_weights(path: Path, datasets: Sequence[Dataset], config: FitConfig) -> F64:
-    if len(datasets) > 1:
-        raise UsageError("weights are for the frames of one dataset; give one dataset")
-    [dataset] = datasets
-    episodes = dataset.columns(["episode_index"])["episode_index"].astype("int64")
-    ahead = getattr(policy_config(config), "chunk_size", None) or round(dataset.fps)
-    return rabc_weights(path, episodes, ahead)

@@ -19,15 +19,13 @@ from __future__ import annotations
 import functools
 import json
 import os
-from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from manip_il import checks
 from manip_il.data.atomic import CHECKPOINT, Record, append_line, new_folder, read_lines, write_file
 from manip_il.errors import FolderExistsError, UsageError
-from manip_il.learn.checkpoint import META_FILE, Origin
 
 if TYPE_CHECKING:  # LeRobot takes seconds to import
     from lerobot.configs.train import TrainPipelineConfig
@@ -57,15 +55,6 @@ def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
     return last
 
 
-def read_step(checkpoint: Path) -> dict[str, Any]:
-    """Return what `training_step.json` in a checkpoint folder holds.
-
-    Raises:
-        ManipError: The file cannot be read.
-    """
-    return checks.read_json(checkpoint / TRAINING_STATE / STEP_FILE, "the step of a run")
-
-
 @contextmanager
 def new_checkpoint(final: Path) -> Generator[Path]:
     """Yield an empty folder to write a checkpoint into.
@@ -87,26 +76,10 @@ def new_checkpoint(final: Path) -> Generator[Path]:
     os.replace(link, final.parent / "last")  # in one rename
 
 
-def write_own_files(checkpoint: Path, origin: Origin, step: Mapping[str, Any]) -> None:
-    """Write the files of a checkpoint that LeRobot does not write.
-
-    Args:
-        checkpoint: The folder of the checkpoint.
-        origin: The content of `manip_il.json`.
-        step: The content of `training_step.json`.
-    """
-    for path, values in (
-        (f"{PRETRAINED_MODEL}/{META_FILE}", origin.to_json()),
-        (f"{TRAINING_STATE}/{STEP_FILE}", step),
-    ):
-        (checkpoint / path).write_text(json.dumps(values, indent=2) + "\n")
-
-
-@contextmanager
 def metric_writers(
     output_dir: Path, step: int, curves: bool, pipeline: TrainPipelineConfig
-) -> Iterator[list[Writer]]:
-    """Yield functions to call with each record, which write it to the metrics file and other
+) -> list[Writer]:
+    """Return functions to call with each record, which write it to the metrics file and other
     requested outputs.
 
     Args:
@@ -118,21 +91,18 @@ def metric_writers(
     Raises:
         UsageError: A requested output's package is not installed.
     """
-    with ExitStack() as stack:
-        writers = [json_lines(output_dir / METRICS_FILE, step)]
-        try:
-            if curves:
-                writers.append(
-                    stack.enter_context(_tensorboard(output_dir / TENSORBOARD_FOLDER, step))
-                )
-            if pipeline.wandb.enable:
-                pipeline.resume = step > 0
-                writers.append(_weights_and_biases(pipeline))
-        except ImportError as error:
-            raise UsageError(
-                f"a requested output of metrics needs {error.name}: pip install {error.name}"
-            ) from error
-        yield writers
+    writers = [json_lines(output_dir / METRICS_FILE, step)]
+    try:
+        if curves:
+            writers.append(_tensorboard(output_dir / TENSORBOARD_FOLDER, step))
+        if pipeline.wandb.enable:
+            pipeline.output_dir, pipeline.resume = output_dir, step > 0
+            writers.append(_weights_and_biases(pipeline))
+    except ImportError as error:
+        raise UsageError(
+            f"a requested output of metrics needs {error.name}: pip install {error.name}"
+        ) from error
+    return writers
 
 
 def json_lines(path: Path, step: int) -> Writer:
@@ -149,19 +119,18 @@ def json_lines(path: Path, step: int) -> Writer:
     return functools.partial(append_line, path)
 
 
-@contextmanager
-def _tensorboard(folder: Path, step: int) -> Iterator[Writer]:
-    """Yield a function that adds a record's numbers to TensorBoard's curves."""
+def _tensorboard(folder: Path, step: int) -> Writer:
+    """Return a function that adds a record's numbers to TensorBoard's curves."""
     from torch.utils.tensorboard import SummaryWriter  # an extra
 
-    with SummaryWriter(str(folder), purge_step=step + 1 if step else None) as writer:
+    writer = SummaryWriter(str(folder), purge_step=step + 1 if step else None)
 
-        def write(record: Record) -> None:
-            for name, value in record.items():
-                writer.add_scalar(name, value, record["step"])
-            writer.flush()
+    def write(record: Record) -> None:
+        for name, value in record.items():
+            writer.add_scalar(name, value, record["step"])
+        writer.flush()
 
-        yield write
+    return write
 
 
 def _weights_and_biases(config: TrainPipelineConfig) -> Writer:

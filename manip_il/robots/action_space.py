@@ -11,48 +11,6 @@ from manip_il.mdp import F64
 
 
 @dataclass(frozen=True, eq=False)
-class ServoUnits:
-    """Conversion of joints [rad] and a gripper opening [m] to servo units and back.
-
-    Servo units are degrees for a joint, and 0 to 100 for the gripper.
-
-    Attributes:
-        openings: Gripper openings [m], rising, (c,).
-        percents: Positions of the gripper's servo at these, 0 to 100, (c,).
-    """
-
-    openings: F64
-    percents: F64
-
-    def of(self, arm: F64, opening: float) -> tuple[F64, float]:
-        """Convert joints and a gripper opening to servo units.
-
-        Args:
-            arm: Joints, (n - 1,) [rad].
-            opening: Opening of the gripper [m].
-
-        Returns:
-            The joints, (n - 1,) [deg], and the gripper's position, 0 to 100.
-        """
-        return np.degrees(arm), float(np.interp(opening, self.openings, self.percents))
-
-    def back(self, arm: F64, percent: float) -> tuple[F64, float]:
-        """Convert servo units to joints and a gripper opening.
-
-        Args:
-            arm: Joints, (n - 1,) [deg].
-            percent: Position of the gripper, 0 to 100.
-
-        Returns:
-            The joints, (n - 1,) [rad], and the opening of the gripper [m].
-        """
-        order = np.argsort(self.percents)  # rising, as `interp` needs them
-        return np.radians(arm), float(
-            np.interp(percent, self.percents[order], self.openings[order])
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class ActionSpace:
     """Names and bounds of an action (n,): joint targets [rad], then the gripper's opening [m].
 
@@ -65,8 +23,9 @@ class ActionSpace:
             gripper, the range of its opening [m]; (n,).
         relative: Whether a learner's target is relative to the measured position, (n,); true except
             for the gripper.
-        units: Set for a robot with servos; `low`, `high`, `scale`, actions and measured states are
-            then in degrees, the gripper's from 0 to 100.
+        units: Set for a robot with servos: openings of its gripper [m], rising, (c,), and positions
+            of the gripper's servo at these, (c,). `low`, `high`, `scale`, actions and measured
+            states are then in degrees, the gripper's from 0 to 100.
     """
 
     names: tuple[str, ...]
@@ -74,7 +33,7 @@ class ActionSpace:
     high: F64
     scale: F64
     relative: NDArray[np.bool_]
-    units: ServoUnits | None = None
+    units: tuple[F64, F64] | None = None
     arm: ClassVar[slice] = slice(-1)  # places of the joints in an action
     gripper: ClassVar[int] = -1  # place of the gripper's opening
 
@@ -89,7 +48,7 @@ class ActionSpace:
             opening: Opening of the gripper [m].
         """
         if self.units is not None:
-            arm, opening = self.units.of(arm, opening)
+            arm, opening = np.degrees(arm), float(np.interp(opening, *self.units))
         action = np.empty(len(self.names))
         action[self.arm] = arm
         action[self.gripper] = opening
@@ -98,7 +57,11 @@ class ActionSpace:
     def split(self, action: F64) -> tuple[F64, float]:
         """Return joint values (n - 1,) [rad] and opening [m] of an action (n,)."""
         arm, gripper = action[self.arm], action[self.gripper]
-        return (arm, gripper) if self.units is None else self.units.back(arm, gripper)
+        if self.units is None:
+            return arm, gripper
+        openings, percents = self.units
+        order = np.argsort(percents)  # rising, as `interp` needs them
+        return np.radians(arm), float(np.interp(gripper, percents[order], openings[order]))
 
     def clip(self, action: NDArray[np.floating], step: int) -> F64:
         """Clip an action to the bounds.

@@ -33,8 +33,7 @@ def outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> F64:
         geom: Id of the geom.
     """
     mesh = int(model.geom_dataid[geom])
-    middle = model.geom_aabb[geom, :3]
-    half = model.geom_aabb[geom, 3:]
+    middle, half = model.geom_aabb[geom].reshape(2, 3)
     points = middle + half * _CORNERS
     # the corners of its box would be too far out, as a mesh may be rotated in its geom
     if mesh >= 0:
@@ -102,7 +101,7 @@ def nearest(
     pair = (first[0], rest[0][0])
     points = np.zeros(6)
     ends = np.empty(6)
-    for one, other in itertools.product(first, [geom for group in rest for geom in group]):
+    for one, other in itertools.product(first, itertools.chain(*rest)):
         apart = distance(model, data, one, other, ends)
         if apart < least:
             least = apart
@@ -118,24 +117,23 @@ class Body:
         self._model = arm_spec(robot).compile()
         self._model.geom_margin[:] = CLEARANCE
         self._data = mujoco.MjData(self._model)
-        self._q = np.array([self._model.joint(name).qposadr[0] for name in robot.joints])
-        gripper = [self._model.joint(name).qposadr[0] for name in robot.gripper.joints]
-        self._data.qpos[gripper] = robot.gripper.open
+        self._q = [self._model.joint(name).qposadr[0] for name in robot.joints]
+        for name, place in zip(robot.gripper.joints, robot.gripper.open, strict=True):
+            self._data.joint(name).qpos[0] = place
         self._at_home = self.meeting(np.asarray(robot.home))
 
     def meets_itself(self, q: F64) -> bool:
         """Return whether parts that are apart at home collide at joints (arm,) [rad]."""
         return not self.meeting(q) <= self._at_home
 
-    def meeting(self, q: F64) -> frozenset[frozenset[int]]:
+    def meeting(self, q: F64) -> set[tuple[int, int]]:
         """Return the pairs of bodies, by id, that collide at joints (arm,) [rad]."""
         self._data.qpos[self._q] = q
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_collision(self._model, self._data)
         bodies = self._model.geom_bodyid
-        return frozenset(
-            frozenset((int(bodies[c.geom1]), int(bodies[c.geom2]))) for c in self._data.contact
-        )
+        pairs = np.sort(bodies[self._data.contact.geom], axis=1).tolist()
+        return {(one, other) for one, other in pairs}
 
 
 def rotation_vector(rotation: F64) -> F64:

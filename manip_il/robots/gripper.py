@@ -7,9 +7,10 @@ linked fingers are thus treated alike.
 """
 
 import bisect
+import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -32,8 +33,7 @@ _LOPSIDED = 0.004
 _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 
-@dataclass(frozen=True, eq=False)
-class Sweep:
+class Sweep(NamedTuple):
     """Measured relation between command and opening, at c commands.
 
     Attributes:
@@ -42,9 +42,9 @@ class Sweep:
         openings: Gaps between the pads at these [m], rising, (c,).
         middles: Offsets along the hand's y of the midpoint between the pads [m], (c,); all 0 if
             both sides move alike.
-        pads: For each finger, the indices of its pads among its geoms, nearest to the other finger
-            first.
-        holding: For each finger, the indices of the geoms that may hold an object.
+        pads: For each finger, the places of its pads among the geoms of all fingers, nearest to
+            the other finger first.
+        holding: For each finger, the places of the geoms that may hold an object.
         linked: Positions of a linkage's undriven joints, by name, (c,).
     """
 
@@ -97,12 +97,10 @@ class Gripper:
         self._linked = [
             (model.joint(prefix + name).qposadr[0], at) for name, at in self._sweep.linked.items()
         ]
-        fingers = finger_geoms(model, config.fingers, prefix)
-        self.geoms = frozenset(geom for finger in fingers for geom in finger)
+        geoms = list(itertools.chain(*finger_geoms(model, config.fingers, prefix)))
+        self.geoms = frozenset(geoms)
         self.pads, self._holding = (
-            tuple(
-                tuple(finger[i] for i in own) for finger, own in zip(fingers, places, strict=True)
-            )
+            tuple(tuple(geoms[place] for place in finger) for finger in places)
             for places in (self._sweep.pads, self._sweep.holding)
         )
         self.lopsided = bool(self._sweep.middles.any())
@@ -151,11 +149,9 @@ class Gripper:
         Args:
             opening: Opening of the gripper [m].
         """
-        return (
-            float(np.interp(opening, self._sweep.openings, self._sweep.middles))
-            if self.lopsided
-            else 0.0
-        )
+        if not self.lopsided:
+            return 0.0
+        return float(np.interp(opening, self._sweep.openings, self._sweep.middles))
 
     def commanded(self, commands: F64, before: F64) -> float:
         """Return the opening [m] that commands ask for, by the one that changed most.
@@ -204,20 +200,13 @@ def sweep(robot: Robot) -> Sweep:
         """For each group, the distances [m] from its geoms to the nearest geom of another group."""
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
-        return [
-            np.array(
-                [
-                    min(
-                        distance(model, data, geom, far)
-                        for other in groups
-                        if other is not own
-                        for far in other
-                    )
-                    for geom in own
-                ]
+        gaps = []
+        for own in groups:
+            others = list(itertools.chain(*(group for group in groups if group is not own)))
+            gaps.append(
+                np.array([min(distance(model, data, geom, far) for far in others) for geom in own])
             )
-            for own in groups
-        ]
+        return gaps
 
     # Geoms that touch no other finger when open: this leaves out those around a jaw's hinge.
     jaws = [
@@ -262,10 +251,8 @@ def sweep(robot: Robot) -> Sweep:
     if np.ptp(middles) < _LOPSIDED:
         middles = [0.0] * len(middles)
         holding = list(map(_near, gaps_at(poses[0], jaws), jaws, least))
-    places = [
-        tuple(tuple(map(finger.index, own)) for finger, own in zip(fingers, some, strict=True))
-        for some in (pads, holding)
-    ]
+    geoms = list(itertools.chain(*fingers))
+    places = [tuple(tuple(map(geoms.index, finger)) for finger in some) for some in (pads, holding)]
     return Sweep(np.array(shares), np.array(openings), np.array(middles), *places, linked=linked)
 
 

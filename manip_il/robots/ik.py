@@ -128,23 +128,16 @@ class ArmIK:
         """Return the world yaw [rad] that counts as zero for a hand at a position (3,) [m]."""
         return yaw_ahead(self._robot, self._data.xanchor[self._shoulder], position)
 
-    def smallest_singular_value(self, q: F64) -> float:
-        """Return the Jacobian's smallest singular value: 0 in a singular posture.
+    def freedom(self, q: F64) -> tuple[float, float]:
+        """Return how far a posture (arm,) [rad] is from a singular one, and from the table.
 
-        Args:
-            q: The posture, (arm,) [rad].
+        Returns:
+            The Jacobian's smallest singular value, which is 0 in a singular posture, and the height
+            of the lowest link beyond the shoulder [m], 0 if there is none.
         """
         self.ee_pose(q)
-        return float(np.linalg.svd(self._site_jacobian(), compute_uv=False)[-1])
-
-    def lowest_link(self, q: F64) -> float:
-        """Return the height of the lowest link beyond the shoulder [m].
-
-        Args:
-            q: The posture, (arm,) [rad].
-        """
-        self.ee_pose(q)
-        return float(self._data.xpos[self._links, 2].min()) if self._links else 0.0
+        values = np.linalg.svd(self._site_jacobian(), compute_uv=False)
+        return float(values[-1]), float(min(self._data.xpos[self._links, 2], default=0.0))
 
     def ee_pose(self, q: F64) -> tuple[F64, F64]:
         """Return the position (3,) [m] and the rotation matrix (3, 3) of `ee` in the world.

@@ -14,6 +14,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from operator import lt
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +24,6 @@ from numpy.typing import NDArray
 from manip_il.checks import open_outside, without_link
 from manip_il.mdp import F64
 from manip_il.robots import HERE, ROBOTS
-from manip_il.robots.files import ModelFiles
 from manip_il.robots.geometry import (
     CLEARANCE,
     Body,
@@ -32,7 +32,7 @@ from manip_il.robots.geometry import (
     hand_down,
     off_yaw,
 )
-from manip_il.robots.robot import Robot
+from manip_il.robots.robot import ModelFiles, Robot
 from manip_il.robots.spec import arm_spec, model_bytes
 from manip_il.robots.table import get_robot
 
@@ -75,14 +75,6 @@ class Reach:
             there = np.delete(there, -1, axis) & np.delete(there, 0, axis)
         return there
 
-    @cached_property
-    def _arrives(self) -> list[list[list[bool]]]:
-        return self.arrives.tolist()
-
-    @cached_property
-    def _corner(self) -> list[float]:
-        return self.origin.tolist()
-
     def error(self, position: Sequence[float] | F64) -> float:
         """Return how far from a position the hand ends up [m].
 
@@ -107,13 +99,9 @@ class Reach:
         Args:
             position: The position, (3,) [m].
         """
-        cells = self._arrives
-        x, y, z = position
-        first_x, first_y, first_z = self._corner
-        x, y, z = (math.floor(at / _CELL) for at in (x - first_x, y - first_y, z - first_z))
-        if not (0 <= x < len(cells) and 0 <= y < len(cells[0]) and 0 <= z < len(cells[0][0])):
-            return False
-        return cells[x][y][z]
+        offsets = zip(position, self.origin.tolist(), strict=True)
+        cell = tuple(math.floor((at - first) / _CELL) for at, first in offsets)
+        return min(cell) >= 0 and all(map(lt, cell, self.arrives.shape)) and self.arrives.item(cell)
 
     def has_each(self, points: F64) -> NDArray[np.bool_]:
         """Return `has` for each of N points, (N, 3) [m]; (N,)."""
@@ -148,10 +136,8 @@ class Reach:
         """
         if self.nearly(position):
             return True
-        (x, y, z), (in_x, in_y, _) = (
-            position,
-            (self.origin + _CELL / 2 * (np.array(self.errors.shape) - 1)).tolist(),
-        )
+        x, y, z = position
+        in_x, in_y, _ = (self.origin + _CELL / 2 * (np.array(self.errors.shape) - 1)).tolist()
         inwards = _LEAN / max(_LEAN, math.hypot(in_x - x, in_y - y))
         return self.nearly((x + inwards * (in_x - x), y + inwards * (in_y - y), z))
 

@@ -12,18 +12,17 @@ import numpy as np
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.mdp import F64
-from manip_il.robots.files import ModelFiles
-from manip_il.robots.robot import GRIPPER, GripperConfig, Robot
+from manip_il.robots.robot import GRIPPER, GripperConfig, ModelFiles, Robot
 
 # defaults for what we add to a model, because its own defaults may set a material or a range
 PLAIN = mujoco.MjSpec()
 _KV_PER_KP = 1 / 20  # [s]: a time constant of one control step at 20 Hz
 _DAMPING = 1.0  # damping of an arm joint [N m s/rad]
-_FINGER_GAINS = (800.0, 20.0, 40.0)  # kp [N/m], kv [N s/m], force [N] of a sliding finger
-_HINGE_GAINS = (20.0, 0.5, 10.0)  # kp [N m/rad], kv [N m s/rad], torque [N m] of a turning finger
-_FINGER_ARMATURE, _FINGER_DAMPING = 0.2, 10.0  # [kg], [N s/m]
+# of a sliding and of a turning finger: kp [N/m or N m/rad], kv, force [N or N m]; then armature
+# [kg or kg m^2] and damping
+_SLIDES = (800.0, 20.0, 40.0), 0.2, 10.0
+_TURNS = (20.0, 0.5, 10.0), 0.005, 0.1
 _LINK_ARMATURE, _LINK_DAMPING = 0.001, 0.02  # for a linkage's joint [kg m^2], [N m s/rad]
-_HINGE_ARMATURE, _HINGE_DAMPING = 0.005, 0.1  # [kg m^2], [N m s/rad]
 WRIST = "wrist"  # the camera on the hand
 # added wrist camera: tilt towards the fingertips [rad], vertical field of view [deg]
 _TILT, _FOVY = 0.45, 70.0
@@ -123,16 +122,14 @@ def arm_joints(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig)
         UnknownName: If the model does not have the hand's body.
     """
     spec = bare_spec(robot, files, hand, gripper)
-    joints, body = list[str](), spec.body(hand)
-    while body.name != "world":
-        hinges = [one for one in body.joints if one.type == mujoco.mjtJoint.mjJNT_HINGE]
-        joints[:0] = [one.name for one in hinges if one.name not in gripper.joints]
-        body = body.parent
+    above = _joints_above(spec.body(hand))
+    hinges = [joint.name for joint in above if joint.type == mujoco.mjtJoint.mjJNT_HINGE]
+    joints = tuple(name for name in hinges if name not in gripper.joints)
     if not joints:
         raise UsageError(
             f"robot {robot}: there is no hinge between the base and hand {hand!r}; check hand"
         )
-    return tuple(joints)
+    return joints
 
 
 def arm_spec(robot: Robot) -> mujoco.MjSpec:
@@ -157,13 +154,13 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
         joint.damping = np.maximum(joint.damping, [_LINK_DAMPING, 0, 0])
     _motorise(robot, spec)
     ee = robot.ee
-    frame = {"pos": ee.position, "quat": ee.quaternion}
-    spec.body(ee.body).add_site(PLAIN.default, name="ee", size=[0.004] * 3, group=4, **frame)
+    spec.body(ee.body).add_site(
+        PLAIN.default, name="ee", size=[0.004] * 3, group=4, pos=ee.position, quat=ee.quaternion
+    )
     for body in spec.bodies:
         body.gravcomp = 1.0
-    for finger in robot.gripper.fingers if robot.gripper.finger_mass else ():
-        body = spec.body(finger)
-        body.mass, body.inertia = robot.gripper.finger_mass, np.full(3, 1e-4)
+        if robot.gripper.finger_mass and body.name in robot.gripper.fingers:
+            body.mass, body.inertia = robot.gripper.finger_mass, np.full(3, 1e-4)
     _paint(robot, spec)
     return spec
 
@@ -178,16 +175,14 @@ def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, place: Sequence
         model: The same arm, compiled.
         place: Position of the camera in the frame `ee`, (3,) [m].
     """
-    rotation = np.zeros(9)
-    quat = np.zeros(4)
+    rotation, quat = np.zeros((3, 3)), np.zeros(4)
     side = np.sign(place[0]) or 1.0
     site = model.site("ee")
-    mujoco.mju_quat2Mat(rotation, site.quat)
+    mujoco.mju_quat2Mat(rotation.ravel(), site.quat)
     back = np.array([side * np.sin(_TILT), 0, -np.cos(_TILT)])
     right = np.array([0.0, side, 0.0])
     axes = np.stack([right, np.cross(back, right), back], axis=1)
-    rotation = rotation.reshape(3, 3)
-    mujoco.mju_mat2Quat(quat, (rotation @ axes).flatten())
+    mujoco.mju_mat2Quat(quat, (rotation @ axes).ravel())
     hand: Any = spec.site("ee")
     hand.parent.add_camera(
         PLAIN.default, name=WRIST, pos=site.pos + rotation @ np.array(place), quat=quat, fovy=_FOVY
@@ -197,10 +192,8 @@ def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, place: Sequence
 def arm_model(robot: Robot) -> mujoco.MjModel:
     """Compile the arm alone, with fixed fingers, for inverse kinematics."""
     spec = arm_spec(robot)
-    for actuator in list(spec.actuators):
-        spec.delete(actuator)
-    for one in [*spec.tendons, *spec.equalities]:
-        spec.delete(one)
+    for element in [*spec.actuators, *spec.tendons, *spec.equalities]:
+        spec.delete(element)
     for name in (*robot.gripper.joints, *linkage(spec, robot)):
         spec.delete(spec.joint(name))
     for geom in spec.geoms:
@@ -268,10 +261,9 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
     """
     kept = {*robot.joints, *robot.gripper.joints, *linked}
     loose = [joint for joint in spec.joints if joint.name not in kept]
-    require(
-        robot.name, "joint", tuple(robot.fixed), [joint for joint in loose if joint.type in _SCALAR]
-    )
     if robot.fixed:
+        scalar = [joint for joint in loose if joint.type in _SCALAR]
+        require(robot.name, "joint", tuple(robot.fixed), scalar)
         _place_bodies(spec, robot.fixed)
     for equality in list(spec.equalities):
         coupled = _coupled(spec, equality)
@@ -299,15 +291,15 @@ def _coupled(spec: mujoco.MjSpec, equality: mujoco._specs.MjsEquality) -> set[st
     ends = equality.name1, equality.name2
     if equality.type == mujoco.mjtEq.mjEQ_JOINT:
         return set(filter(None, ends))
-    one, other = (_joints_below(spec.body(name)) for name in ends)
+    one, other = ({joint.name for joint in _joints_above(spec.body(name))} for name in ends)
     return one ^ other
 
 
-def _joints_below(body: Any) -> set[str]:
-    """The names of the joints between the world and a body."""
+def _joints_above(body: Any) -> list[Any]:
+    """The joints between the world and a body, from the world outwards."""
     if body is None or body.name == "world":
-        return set()
-    return {joint.name for joint in body.joints} | _joints_below(body.parent)
+        return []
+    return [*_joints_above(body.parent), *body.joints]
 
 
 def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
@@ -380,9 +372,7 @@ def _scene_elements(spec: mujoco.MjSpec, hand: str, kept: str) -> Iterator[Any]:
     yield from [body for body, names in trees if hand and hand not in names]
     used = {name for material in spec.materials for name in material.textures}
     sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX
-    yield from [
-        texture for texture in spec.textures if texture.type == sky or texture.name not in used
-    ]
+    yield from [one for one in spec.textures if one.type == sky or one.name not in used]
     yield from [camera for camera in spec.cameras if not kept or camera.name != kept]
     for kind in ("actuators", "sensors", "lights", "sites", "tuples"):
         yield from list(getattr(spec, kind))
@@ -414,13 +404,12 @@ def _motorise(robot: Robot, spec: mujoco.MjSpec) -> None:
     for name, *ends in zip(gripper.joints, gripper.closed, gripper.open, strict=True):
         joint = spec.joint(name)
         slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
-        joint.damping = np.array([_FINGER_DAMPING if slides else _HINGE_DAMPING, 0, 0])
-        joint.armature = _FINGER_ARMATURE if slides else _HINGE_ARMATURE
+        (kp, kv, force), joint.armature, damping = _SLIDES if slides else _TURNS
+        joint.damping = np.array([damping, 0, 0])
         joint.frictionloss = 0.0
         if joint.range[0] >= joint.range[1]:  # a linkage that runs past its end folds over
             in_degrees = joint.compiler.degree and not slides
             joint.range = np.degrees(sorted(ends)) if in_degrees else sorted(ends)
-        kp, kv, force = _FINGER_GAINS if slides else _HINGE_GAINS
         _position_actuator(spec, joint, (kp, kv, gripper.force or force))
 
 

@@ -13,8 +13,19 @@ from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.option import NameOrPath
 from manip_il.robots import ROBOTS
-from manip_il.robots.files import KEYS, ModelFiles, read
-from manip_il.robots.robot import FOUND, GRIPPER, SOFT, UPRIGHT, YAWS, Costs, GripperConfig, Robot
+from manip_il.robots.robot import (
+    FOUND,
+    GRIPPER,
+    KEYS,
+    SOFT,
+    UPRIGHT,
+    YAWS,
+    Costs,
+    GripperConfig,
+    ModelFiles,
+    Robot,
+    read,
+)
 from manip_il.robots.spec import arm_joints
 
 SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place

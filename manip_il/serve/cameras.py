@@ -15,7 +15,7 @@ from manip_il.serve.station import Station
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import Picture
-from manip_il.sim.window import Clock
+from manip_il.sim.view import Clock
 
 RATE = 30  # pictures per second
 _QUALITY = 90  # JPEG quality
@@ -46,17 +46,20 @@ class Cameras:
         self._socket: Any = zmq.Context.instance().socket(zmq.PUB)
         self._socket.setsockopt(zmq.SNDHWM, 2)
         self._socket.setsockopt(zmq.LINGER, 0)
-        try:
-            self._socket.bind(f"tcp://127.0.0.1:{port}")
-        except zmq.ZMQError as error:
-            raise UsageError(
-                f"--camera_port={port} cannot be used ({error}); give another one"
-            ) from error
         self._stop = threading.Event()
         # an OpenGL context belongs to the thread that made it; the new thread makes its own
         render.close()
         self._thread = ThreadPoolExecutor(1)
-        self._thread.submit(self._send).result()
+        try:
+            self._socket.bind(f"tcp://127.0.0.1:{port}")
+            self._thread.submit(self._send).result()
+        except BaseException as error:
+            self._release()
+            if isinstance(error, zmq.ZMQError):
+                raise UsageError(
+                    f"--camera_port={port} cannot be used ({error}); give another one"
+                ) from error
+            raise
         self._running = self._thread.submit(self._run)
 
     def close(self) -> None:
@@ -65,10 +68,13 @@ class Cameras:
         Raises the error that has ended the stream, if one has.
         """
         self._stop.set()
+        self._release()
+        self._running.result()
+
+    def _release(self) -> None:
         self._thread.submit(render.close)
         self._thread.shutdown()
         self._socket.close()
-        self._running.result()
 
     def _run(self) -> None:
         clock = Clock(RATE)

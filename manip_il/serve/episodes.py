@@ -55,14 +55,11 @@ class ServedEpisodes:
         self._expert = LadderExpert(self._env.scene)
         self.driver = Actor.EXPERT
         self._reads: list[tuple[Read, Actor]] | None = None
-        self._journal = (
-            Journal(folder, env_spec(config), env_fingerprint(config))
-            if folder is not None
-            else None
-        )
+        self._journal: Journal | None = None
         there: list[int] = []
-        if folder is not None and self._journal is not None:
+        if folder is not None:
             require_ours(folder, EPISODES)
+            self._journal = Journal(folder, env_spec(config), env_fingerprint(config))
             self._journal.prepare()
             recording = Recording.read(folder)
             if recording.provenance.get("driver", SERVED) != SERVED:

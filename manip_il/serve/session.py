@@ -26,7 +26,7 @@ from manip_il.serve.operator import INTERRUPT, Operator, weigh_session
 from manip_il.serve.station import Mover, Station
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.window import Window
+from manip_il.sim.view import Window
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import env_spec

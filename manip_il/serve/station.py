@@ -21,7 +21,8 @@ from manip_il.serve.bus import STEPS, Bus, Calibration, encoder_steps
 from manip_il.serve.config import IDEAL, SessionConfig
 from manip_il.serve.servo import Follower
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.window import Clock
+from manip_il.sim.scene import Scene
+from manip_il.sim.view import Clock
 from manip_il.sim.world import World
 from manip_il.worlds.ladder.expert import LadderExpert
 
@@ -86,7 +87,7 @@ class Station:
                 f" an arm with lerobot.robot_type: {FEETECH}"
             )
         # a copy, as its motors become servos
-        env.world = World(replace(env.scene, model=copy.copy(env.scene.model)))
+        env.world = World(Scene(robot, env.scene.task, copy.copy(env.scene.model)))
         self.env, self._config = env, config
         self._servos = replace(config.servos, **IDEAL) if config.servo == "ideal" else config.servos
         self._expert = LadderExpert(env.scene)

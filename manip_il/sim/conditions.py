@@ -2,10 +2,9 @@
 
 An episode's seed alone decides its values.
 
-The drawn values are applied to the model by `variation.py`, to pictures by `view.py`, to what a
-policy observes by `env.py`, and during the episode by `events.py`.
-
-What an episode's condition can vary: one table of bounds, draws, and places in a state's variation.
+`RANGES` is the one table of what can vary: bounds, draws, and places in a state's variation. The
+drawn values are applied to the model by `variation.py`, to pictures by `view.py`, to what a policy
+observes by `env.py`, and during the episode by `events.py`.
 """
 
 from __future__ import annotations
@@ -76,11 +75,6 @@ class Quantity(NamedTuple):
     places: Sequence[int] | I64 = range(0)
     nominal: float = 0.0
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether the ends of its range are whole numbers."""
-        return self.draw in (_whole, _whole_and_seed)
-
 
 # Place 0 of the world's part of a variation is the shape's. The camera at the side got its places
 # after the others.
@@ -88,7 +82,7 @@ RANGES = {
     "action_noise": Quantity((0, 1)),
     "random_actions": Quantity((0, 1)),
     "knock": Quantity((0, 0.3), of_object=True),
-    "knock_step": Quantity((0, 10_000), draw=_whole),
+    "knock_step": Quantity((0, 10_000), of_object=True, draw=_whole),
     "joint_noise": Quantity((0, 1), "sensing"),
     "position_noise": Quantity((0, 1), "sensing", of_object=True),
     "delay": Quantity((0, 100), draw=_whole),
@@ -158,12 +152,10 @@ class Condition:
         checks.name("a condition's name", name)
         if "knock" in ranges:
             ranges = {"knock_step": _KNOCK_STEP} | ranges
+        elif "knock_step" in ranges:
+            raise UsageError(f"condition {name!r} has a knock_step but no knock; give both")
         ranges = {one: _range(name, one, range_) for one, range_ in ranges.items()}
-        kept = {
-            one: ranges[one]
-            for one in RANGES
-            if one in ranges and (one != "knock_step" or "knock" in ranges)
-        }
+        kept = {one: ranges[one] for one in RANGES if one in ranges}
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
     def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
@@ -188,8 +180,14 @@ class Condition:
             and (sizes or name != "size")
         }
         if "size" in kept and sizes is not None:
-            kept["size"] = _overlap(self.name, kept["size"], sizes)
-        if self.ranges and not kept.keys() - {"knock_step"}:
+            (least, most), asked = sizes, kept["size"]
+            low, high = kept["size"] = max(asked[0], least), min(asked[1], most)
+            if low > high:
+                raise UsageError(
+                    f"{self.name}: size is {words(asked)} m, and the task takes objects of"
+                    f" {least:.3g} to {most:.3g} m; choose other sizes"
+                )
+        if self.ranges and not kept:
             return None
         return Condition(self.name, **kept)
 
@@ -271,36 +269,20 @@ def _range(condition: str, name: str, given: Any) -> Range:
     """A range as a tuple, from what Python or YAML gives: a pair or a number."""
     if name not in RANGES:
         raise UnknownName(f"key in {condition}:", name[: checks.LONGEST_NAME], RANGES)
-    what, ends = (
-        f"{condition}: {name}",
-        given if isinstance(given, list | tuple) else (given, given),
-    )
+    least, most = RANGES[name].bounds
+    is_whole = RANGES[name].draw in (_whole, _whole_and_seed)
     try:
-        low, high = (checks.number(what, end) for end in ends)
+        low, high = given if isinstance(given, list | tuple) else (given, given)
+        low = checks.number(name, low, least, most)
+        high = checks.number(name, high, low, most)
+        if is_whole and (low % 1 or high % 1):
+            raise ValueError(given)
     except (ManipError, ValueError):
         raise UsageError(
-            f"{what} is {checks.shorten(given)}; expected a number, or [low, high]"
+            f"{condition}: {name} is {checks.shorten(given)}; expected a{' whole' * is_whole}"
+            f" number, or [low, high], from {least} to {most}"
         ) from None
-    least, most = RANGES[name].bounds
-    if not least <= low <= high <= most:
-        raise UsageError(
-            f"{what} is [{low}, {high}]; expected low <= high, both from {least} to {most}"
-        )
-    if RANGES[name].is_whole and (low % 1 or high % 1):
-        raise UsageError(f"{what} is [{low}, {high}]; expected whole numbers")
     return given if isinstance(given, tuple) else (low, high)
-
-
-def _overlap(name: str, asked: Range, sizes: Range) -> Range:
-    """The sizes that are both asked for and possible in a task."""
-    low, high = max(asked[0], sizes[0]), min(asked[1], sizes[1])
-    if low > high:
-        takes = f"{sizes[0]:.3g} to {sizes[1]:.3g} m"
-        raise UsageError(
-            f"{name}: size is {words(asked)} m, and the task takes objects of {takes}; choose other"
-            " sizes"
-        )
-    return low, high
 
 
 NOMINAL = Condition()

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.option import option
+from manip_il.option import check_bounds, option
 
 DT_SIM = 0.002  # longest physics step [s]
 MOST_HZ = round(1 / DT_SIM)
@@ -54,7 +54,6 @@ class Episodes:
 
 CAMERAS = ("front", "side", "wrist")
 MIN_SIDE, MAX_SIDE = 16, 2048  # sides of a picture [pixels]
-_BRIGHTNESS = (0.1, 2.0)
 
 
 @dataclass(frozen=True)
@@ -75,17 +74,18 @@ class Look:
     """
 
     shadows: bool = option(False, "draw shadows; rendering then takes two to six times as long")
-    brightness: float = option(1.0, "factor on the brightness of every lamp, 0.1 to 2")
-    light_turn: float = option(0.0, "rotation of the lamps about the vertical, -180 to 180 [deg]")
+    brightness: float = option(
+        1.0, "factor on the brightness of every lamp, 0.1 to 2", at_least=0.1, at_most=2
+    )
+    light_turn: float = option(
+        0.0,
+        "rotation of the lamps about the vertical, -180 to 180 [deg]",
+        at_least=-180,
+        at_most=180,
+    )
 
     def __post_init__(self) -> None:
-        low, high = _BRIGHTNESS
-        if not low <= self.brightness <= high:
-            raise UsageError(
-                f"brightness is {self.brightness}; expected a factor from {low} to {high}"
-            )
-        if not -180 <= self.light_turn <= 180:
-            raise UsageError(f"light_turn is {self.light_turn}; expected -180 to 180 degrees")
+        check_bounds(self)
 
 
 FILM = Look(shadows=True)  # for people: shadows show how high things are

@@ -20,14 +20,13 @@ from manip_il.seeding import rng_for
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CAMERAS, CameraConfig, Episodes, Look, require_cameras
 from manip_il.sim.events import Events, draw_posture
-from manip_il.sim.points import points_in
-from manip_il.sim.render import Picture, pictures, projections
-from manip_il.sim.scene import build_scene
+from manip_il.sim.render import Picture, pictures, points_in, projections
+from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.shape import ANY
 from manip_il.sim.task import Task
 from manip_il.sim.variation import with_drawn
-from manip_il.sim.window import Window, require_display
-from manip_il.sim.world import SCENES_KEPT, Scene, World
+from manip_il.sim.view import Window, require_display
+from manip_il.sim.world import Scene, World
 
 _JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
 
@@ -104,12 +103,24 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.metadata = self.metadata | {"render_fps": self.config.control_hz}
         self._max_episode_steps = self.config.horizon
         self.task = task.name
-        limits = np.vstack([self.scene.actions.low, self.scene.actions.high])
-        turn = 2 * np.pi if robot.lerobot is None else 360.0
-        # a turn each way for an unlimited joint
-        limits = np.where(np.isfinite(limits), limits, np.sign(limits) * turn)
-        self.action_space = gymnasium.spaces.Box(*limits.astype(np.float32), dtype=np.float32)
-        self.observation_space = self._observation_space()
+        turn = 2 * np.pi if robot.lerobot is None else 360.0  # for a joint without limits
+        low, high = (
+            np.nan_to_num(end, posinf=turn, neginf=-turn).astype(np.float32)
+            for end in (self.scene.actions.low, self.scene.actions.high)
+        )
+        self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
+        sizes = {
+            "agent_pos": len(robot.joint_names),
+            "environment_state": len(environment_state_names(self.scene)),
+        }
+        spaces: dict[str, gymnasium.Space[Any]] = {
+            name: gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+            for name, size in sizes.items()
+        }
+        if cameras:
+            picture = gymnasium.spaces.Box(0, 255, (*cameras.size, 3), np.uint8)
+            spaces["pixels"] = gymnasium.spaces.Dict(dict.fromkeys(self.cameras, picture))
+        self.observation_space = gymnasium.spaces.Dict(spaces)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -146,19 +157,17 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     def start(self, seed: int) -> None:
         """Start the episode of a seed: `reset` without making an observation."""
-        world = self.world
-        scene = self.scene
+        world, scene = self.world, self.scene
         rng = rng_for(seed, "reset")
         self._begin(seed)
         world.vary(with_drawn(scene.nominal, self.drawn))
-        data, robot = world.data, scene.robot
+        data, home = world.data, np.asarray(scene.robot.home)
         mujoco.mj_resetData(world.model, data)
         for name, pose in self._task.draw(rng, world).poses.items():
             world.place(name, *pose)
-        posture = np.asarray(robot.home) + rng.uniform(-1, 1, len(robot.joints)) * _JOINT_JITTER
+        posture = home + rng.uniform(-1, 1, len(home)) * _JOINT_JITTER
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = posture
-        opening = rng.uniform(scene.gripper.least, scene.gripper.most)
-        scene.gripper.put(data, opening)
+        scene.gripper.put(data, rng.uniform(scene.gripper.least, scene.gripper.most))
         if largest := self.drawn.get("posture"):
             draw_posture(world, rng_for(seed, "posture"), largest)
         world.update()
@@ -310,8 +319,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         images: dict[str, Picture] = {}
         keypoints: dict[str, F32] = {}
         if self._view:
-            points, images = [*points_in(self.world).values()], self._pictures(self._view)
-            keypoints = projections(self.scene, self._view, np.stack(points)) if points else {}
+            images = self._pictures(self._view)
+            if points := [*points_in(self.world).values()]:
+                keypoints = projections(self.scene, self._view, np.stack(points))
         state, text = world.measured.astype(np.float32), self.task_description
         self._seen.append(Observation(state, environment_state(world), images, text, keypoints))
         late, first = self._seen[-1 - min(self._delay, len(self._seen) - 1)], self._seen[0]
@@ -340,13 +350,12 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
         None unless render_mode is `rgb_array`.
         """
+        if self.render_mode == "rgb_array":
+            return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
         if self.render_mode == "human":
-            if self._window is None:
-                self._window = Window(self.scene, self.config.control_hz)
+            self._window = self._window or Window(self.scene, self.config.control_hz)
             self._window.show(self.data, self.world.variation)
-        if self.render_mode != "rgb_array":
-            return None
-        return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
+        return None
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -370,17 +379,6 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             observation["pixels"] = seen.images
         return observation
 
-    def _observation_space(self) -> gymnasium.spaces.Dict:
-        n, k = len(self.scene.robot.joint_names), len(environment_state_names(self.scene))
-        spaces: dict[str, gymnasium.Space[Any]] = {
-            "agent_pos": gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float32),
-            "environment_state": gymnasium.spaces.Box(-np.inf, np.inf, (k,), np.float32),
-        }
-        if self._view:
-            picture = gymnasium.spaces.Box(0, 255, (*self._view.size, 3), np.uint8)
-            spaces["pixels"] = gymnasium.spaces.Dict(dict.fromkeys(self.cameras, picture))
-        return gymnasium.spaces.Dict(spaces)
-
 
 def environment_state(world: World) -> F32:
     """Return the numbers that the task observes, float32 (k,); lengths in [m]."""
@@ -393,11 +391,11 @@ def environment_state_names(scene: Scene) -> tuple[str, ...]:
     world, names = World(scene), list[str]()
     world.update()
     for name, value in scene.task.observe(world).items():
-        if np.ndim(value) and np.shape(value) != (3,):
-            shape = np.shape(value)
+        shape = np.shape(value)
+        if shape not in ((), (3,)):
             raise UsageError(
                 f"observe of task {scene.task.name}: {name} has shape {shape}; expected a number or"
                 " (3,)"
             )
-        names += [f"{name}.{axis}" for axis in "xyz"] if np.ndim(value) else [name]
+        names += [f"{name}.{axis}" for axis in "xyz"] if shape else [name]
     return tuple(names)

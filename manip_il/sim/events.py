@@ -4,8 +4,7 @@ Functions that change the world do so in place, and draw from the generator that
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from manip_il.mdp import F64
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import Condition, merged
+from manip_il.sim.scene import TABLE
 from manip_il.sim.task import Task
 from manip_il.sim.world import World
 
@@ -26,8 +26,7 @@ _MAX_DRAWS = 100
 _OVERLAP = -0.004  # contact distance below which a moved object overlaps something [m]
 
 
-@dataclass(frozen=True)
-class Kind:
+class Kind(NamedTuple):
     """One entry of `KINDS`: a change of the world (`change`), or of one action (`wrong`)."""
 
     words: str
@@ -82,7 +81,7 @@ def move_object(
     name = world.scene.task.objects_in(world)[0]
     one = world.scene.objects[name]
     before, start = world.physics(), world.data.qpos[one.q : one.q + 7].copy()
-    half = min(world.extents(name)) / 2
+    half, table = min(world.extents(name)) / 2, world.scene.model.geom(TABLE)
     for _ in range(_MAX_DRAWS):
         angle, length = rng.uniform(0, 2 * np.pi), rng.uniform(*distance)
         pose = start.copy()
@@ -92,11 +91,14 @@ def move_object(
         if height > 0:
             turn = rng.normal(size=4)
             pose[3:] = turn / np.linalg.norm(turn)
-        if (
-            world.reach.has([*pose[:2], half])
-            and _is_on_table(world, pose)
-            and _place(world, name, pose)
-        ):
+        over_table = (np.abs(pose[:2] - table.pos[:2]) < table.size[:2] - 0.05).all()
+        if not over_table or not world.reach.has([*pose[:2], half]):
+            continue
+        world.place(name, pose[:3], pose[3:])
+        _settle(world)
+        contact = world.data.contact
+        own = (world.model.geom_bodyid[contact.geom] == one.body).any(axis=1)
+        if (contact.dist[own] > _OVERLAP).all():
             return
     world.restore(before, world.variation)
 
@@ -139,8 +141,8 @@ def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
     model, contact = world.scene.model, world.data.contact
     robot = model.body_rootid[model.site_bodyid[world.scene.ee_site]]
     of_robot = (model.body_rootid[model.geom_bodyid[contact.geom]] == robot).any(axis=1)
-    touching = zip(contact.geom[of_robot].tolist(), contact.dist[of_robot], strict=True)
-    return {(a, b, deep) for (a, b), dist in touching for deep in (False, bool(dist < _OVERLAP))}
+    touching = np.column_stack([contact.geom, contact.dist < _OVERLAP])[of_robot].tolist()
+    return {(a, b, deep) for a, b, overlaps in touching for deep in (False, bool(overlaps))}
 
 
 def _open_gripper(world: World, rng: np.random.Generator) -> None:
@@ -212,9 +214,7 @@ class Events:
         self._world = world
         self._drawn = drawn
         self._seed = seed
-        self._kinds = {
-            moment: (name, KINDS[name]) for name, moment in drawn.items() if name in KINDS
-        }
+        self._kinds = {moment: name for name, moment in drawn.items() if name in KINDS}
 
     def before(self, step: int) -> bool:
         """Apply the events of a step to the world; return whether a perturbation changed it.
@@ -225,11 +225,11 @@ class Events:
         world, drawn = self._world, self._drawn
         if step == drawn.get("knock_step"):
             move_object(world, rng_for(self._seed, "knock"), (drawn["knock"], drawn["knock"]))
-        name, kind = self._kinds.get(step, ("", None))
-        if kind is None or kind.change is None:
+        name = self._kinds.get(step)
+        if name is None or (change := KINDS[name].change) is None:
             return False
         before, qpos = world.physics(), world.data.qpos.copy()
-        kind.change(world, rng_for(self._seed, f"perturbation {name}"))
+        change(world, rng_for(self._seed, f"perturbation {name}"))
         if np.abs(world.data.qpos - qpos).max() >= _NOTICEABLE:
             return True
         world.restore(before, world.variation)
@@ -242,9 +242,9 @@ class Events:
             action: The action of the policy, (n,); an event may add noise to it, or replace it.
             step: The control step.
         """
-        name, kind = self._kinds.get(step, ("", None))
-        if kind is not None and kind.wrong is not None:
-            return kind.wrong(action, self._world, rng_for(self._seed, f"perturbation {name}"))
+        name = self._kinds.get(step)
+        if name is not None and (wrong := KINDS[name].wrong) is not None:
+            return wrong(action, self._world, rng_for(self._seed, f"perturbation {name}"))
         if share := self._drawn.get("random_actions"):
             rng = rng_for(self._seed, "random actions", step)
             if rng.uniform() < share:
@@ -262,17 +262,3 @@ def _settle(world: World) -> None:
     """Compute everything that depends on positions, contacts included."""
     world.update()
     mujoco.mj_forward(world.model, world.data)
-
-
-def _is_on_table(world: World, pose: F64) -> bool:
-    table = world.scene.model.geom("table")
-    return bool(np.all(np.abs(pose[:2] - table.pos[:2]) < table.size[:2] - 0.05))
-
-
-def _place(world: World, name: str, pose: F64) -> bool:
-    """Put an object at rest at `pose` (7,); return False if it overlaps something."""
-    world.place(name, pose[:3], pose[3:])
-    _settle(world)
-    body, bodies = world.scene.objects[name].body, world.model.geom_bodyid
-    own = (bodies[world.data.contact.geom] == body).any(axis=1)
-    return bool((world.data.contact.dist[own] > _OVERLAP).all())

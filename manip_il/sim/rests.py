@@ -23,6 +23,7 @@ _DIRECTIONS = 500  # of a hull with more points, only the outermost in this many
 # angles between sides that count as one, and between faces of one side [rad]
 _ALIKE, _COPLANAR = 0.2, 0.01
 _FINGER = 0.012  # half a finger's width plus its sideways error [m]
+_STRIP = np.array([[-_FINGER], [_FINGER]])
 _LEVEL = 0.004  # spacing of the heights at which widths are measured [m]
 _TIP = 0.001  # height of the lowest of those levels over the fingertips [m]
 _APART = math.radians(25)  # least angle between two grasps [rad]
@@ -149,9 +150,9 @@ def _rest(hull: ConvexHull, centre: F64, down: F64, lowest: float, widest: float
     flat, turns = (hull.points - centre) @ axes.T, _turns(hull, axes)
     deepest = max(lowest, tall - DEEPEST)
     for at in (max(deepest, min(height, tall / 2)), deepest):  # heights of the hand over the table
-        ways, any_yaw = _ways(
-            _all_ways(hull, heights + height, flat, at - lowest, turns), widest - LEAST_ROOM
-        )
+        levels = np.arange(at - lowest + _TIP, (heights + height).max() - _TIP / 2, _LEVEL)
+        cuts = [_cut(hull, heights + height, flat, level) for level in levels.tolist()]
+        ways, any_yaw = _ways([_way(cuts, turn) for turn in turns], widest - LEAST_ROOM)
         if min(way.slope for way in ways) <= _SLOPE:  # else it narrows upwards: grasp lower
             break
     turned = np.array([[math.cos(way.turn), math.sin(way.turn)] for way in ways])
@@ -170,13 +171,6 @@ def _rest(hull: ConvexHull, centre: F64, down: F64, lowest: float, widest: float
         fits=min(way.width for way in ways) <= widest - LEAST_ROOM and tall >= LEAST_HEIGHT,
         round=any_yaw,
     )
-
-
-def _all_ways(hull: ConvexHull, heights: F64, flat: F64, tips: float, turns: F64) -> list[_Way]:
-    """The grasp at each turn, with the fingertips at the height `tips` over the table [m]."""
-    levels = np.arange(tips + _TIP, heights.max() - _TIP / 2, _LEVEL).tolist()
-    cuts = [_cut(hull, heights, flat, level) for level in levels]
-    return [_way(cuts, turn) for turn in turns]
 
 
 def _cut(hull: ConvexHull, heights: F64, flat: F64, level: float) -> F64:
@@ -225,15 +219,14 @@ def _ways(ways: Sequence[_Way], widest: float) -> tuple[list[_Way], bool]:
         return [narrowest], True
     if not fitting:
         return [narrowest], False
-    steepest = min(way.slope for way in fitting) + _STEEP
-    kept: list[_Way] = []
-    for way in sorted((way for way in fitting if way.slope <= steepest), key=lambda way: way.width):
-        beside = [one for one in ways if _between(one.turn, way.turn) < _APART / 2]
-        if way.width <= min(one.width for one in beside) + 1e-4 and all(
-            _between(one.turn, way.turn) >= _APART for one in kept
-        ):
+    shallowest, kept = min(fitting, key=lambda way: way.slope), list[_Way]()
+    for way in sorted(fitting, key=lambda way: way.width):
+        beside = (one.width for one in ways if _between(one.turn, way.turn) < _APART / 2)
+        apart = all(_between(one.turn, way.turn) >= _APART for one in kept)
+        is_least = way.width <= min(beside) + 1e-4
+        if way.slope <= shallowest.slope + _STEEP and apart and is_least:
             kept.append(way)
-    return kept or [min(fitting, key=lambda way: way.slope)], False
+    return kept or [shallowest], False
 
 
 def _way(cuts: Sequence[F64], turn: float) -> _Way:
@@ -245,25 +238,15 @@ def _way(cuts: Sequence[F64], turn: float) -> _Way:
         there = (across.min(axis=1) <= _FINGER) & (across.max(axis=1) >= -_FINGER)
         if there.any():
             (a, b), (p, q) = across[there].T, along[there].T
-            way = np.where(a == b, 1e-12, b - a)
-            shares = [np.clip((end - a) / way, 0, 1) for end in (-_FINGER, _FINGER)]
-            met = np.concatenate([p + share * (q - p) for share in shares])
+            shares = (_STRIP - a) / np.where(a == b, 1e-12, b - a)
+            met = p + shares.clip(0, 1) * (q - p)
             ends.append((met.min(), met.max()))
     low, high = np.array(ends).T
+    least, most = float(low.min()), float(high.max())
     up = min(2, len(ends) - 1)
-    rise = max(up * _LEVEL, _LEVEL)
-    steep = (
-        max((low[up] - low[0]) * (low.argmin() == 0), (high[0] - high[up]) * (high.argmax() == 0))
-        / rise
-    )
-    length = float(np.max(lengths) - np.min(lengths))
-    return _Way(
-        turn,
-        float(high.max() - low.min()),
-        length,
-        float(high.max() + low.min()) / 2,
-        max(0.0, float(steep)),
-    )
+    rises = (low[up] - low[0]) * (low[0] == least), (high[0] - high[up]) * (high[0] == most)
+    slope = max(0.0, float(max(rises) / max(up * _LEVEL, _LEVEL)))
+    return _Way(turn, most - least, float(np.ptp(lengths)), (most + least) / 2, slope)
 
 
 def _between(one: float, other: float) -> float:

@@ -9,8 +9,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from manip_il.checks import one_line
 from manip_il.errors import UnknownName, UsageError
-from manip_il.robots.action_space import ActionSpace, ServoUnits
+from manip_il.mdp import I64
+from manip_il.robots.action_space import ActionSpace
 from manip_il.robots.geometry import angle_across, outline, yaw_ahead
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.robot import TABLE_BEYOND, CameraPose, Robot
@@ -18,16 +20,18 @@ from manip_il.robots.spec import add_wrist_camera, arm_spec, copy_options
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.rests import LEAST_HEIGHT, LEAST_ROOM, Hull
-from manip_il.sim.task import Task
+from manip_il.sim.shape import ANY
 from manip_il.sim.variation import Object
-from manip_il.sim.world import SCENES_KEPT, USUAL, Scene
 
 _EMPTY = Path(__file__).with_name("empty.xml")
+STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+# scenes cached per process, and what is computed from one: the finest meshes take 64 MB
+SCENES_KEPT = 4
+USUAL = 0.15  # half width of Panda's workspace [m]
 PREFIX = "robot/"  # prefix of the robot's names in a scene
 TABLE = "table"  # name of the table's geom
 _THICK = 0.04  # thickness of the table's top [m]
-# test rotation of the last joint, to find its direction; margin to its limits [rad]
-_TURN, _SPARE_TURN = 0.1, 0.1
+_SPARE_TURN = 0.1  # margin to the limits of the last joint [rad]
 # height of the workspace for which `_CAMERAS` are placed; its half width is `USUAL` [m]
 _SEEN_HEIGHT = 0.45
 # Camera positions, from the workspace's middle on the table; height above it of the point that they
@@ -39,8 +43,69 @@ _ON_TABLE = 0.02
 _PEDESTAL = 0.13  # half the pedestal's width [m]
 
 
+class Scene:
+    """A robot and a task's objects as one compiled model, and the addresses of its named parts.
+
+    Attributes:
+        robot: The robot.
+        task: The `Task`.
+        name: Robot and task, for messages.
+        model: The compiled model.
+        state_size: Length of `State.physics`.
+        gripper: The robot's gripper in the model.
+        actions: Names and bounds of actions.
+        objects: Free bodies, by name.
+        hulls: Convex hulls, by name, of the objects that are meshes.
+        furniture: Ids of the geoms of mocap bodies, (g,): goal markers and the fixed parts of the
+            task.
+        arm_q: Indices of the arm's joints into `qpos`, (arm,).
+        arm_ctrl: Indices of the arm's actuators into `ctrl`, (arm,).
+        ee_site: Id of the site `ee`.
+        shoulder: Id of the arm's first joint.
+        yaws: Least and greatest yaw of the hand, relative to `World.ahead` [rad].
+        nominal: The variation of the model as compiled, (v,).
+        draws_shape: Whether each episode draws the shape of the object; the model as compiled has a
+            cube.
+        scale: Width of the workspace as a share of Panda's, at most 1.
+    """
+
+    def __init__(self, robot: Robot, task: Any, model: mujoco.MjModel):
+        """Find the parts of a scene.
+
+        Args:
+            robot: The robot.
+            task: The `Task`, fitted to the robot.
+            model: The compiled model.
+        """
+        self.robot = robot
+        self.task = task
+        self.name = f"{robot.name} {task.name}"
+        self.model = model
+        self.state_size = mujoco.mj_stateSize(model, STATE_KIND)
+        joints = [model.joint(PREFIX + name) for name in robot.joints]
+        motors = [model.actuator(PREFIX + name) for name in robot.joints]
+        self.gripper = Gripper(robot, model, PREFIX)
+        self.actions = _action_space(robot, joints, self.gripper)
+        self.objects = _objects(model)
+        self.hulls = {
+            name: Hull(model, one.body, one.geom, robot.ee.lowest, self.gripper.most)
+            for name, one in self.objects.items()
+            if model.geom_type[one.geom] == variation.MESH
+        }
+        roots = model.body_rootid[model.geom_bodyid]
+        self.furniture: I64 = np.flatnonzero(model.body_mocapid[roots] >= 0)
+        self.arm_q = np.array([joint.qposadr[0] for joint in joints], np.int64)
+        self.arm_ctrl = np.array([motor.id for motor in motors], np.int64)
+        self.ee_site: int = model.site(PREFIX + "ee").id
+        self.shoulder: int = joints[0].id
+        self.yaws = _yaws(robot, model, joints, self.arm_q)
+        self.nominal = variation.nominal(model, self.objects)
+        self.draws_shape: bool = task.shape.kind == ANY
+        self.scale = min(1.0, robot.workspace.half_width / USUAL)
+
+
 @lru_cache(SCENES_KEPT)
-def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
+def build_scene(robot: Robot, task: Any, step: float = DT_SIM) -> Scene:
     """Return the scene of a robot and a task, compiled once and cached.
 
     Args:
@@ -58,17 +123,16 @@ def build_scene(robot: Robot, task: Task, step: float = DT_SIM) -> Scene:
         spec.option.timestep = step
         model = spec.compile()
     except ValueError as error:
-        why = " ".join(str(error).split())
         raise UsageError(
             f"the scene of robot {robot.name} ({robot.files.model}) and task {task.name} does not"
-            f" compile: {why}"
+            f" compile: {one_line(error)}"
         ) from None
-    scene = _index(robot, task, model)
+    scene = Scene(robot, task, model)
     _check_objects(scene)
     return scene
 
 
-def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
+def scene_spec(robot: Robot, task: Any) -> mujoco.MjSpec:
     """Return the uncompiled scene; world z = 0 is the table's top, x points away from the robot."""
     spec = mujoco.MjSpec.from_file(str(_EMPTY))
     spec.modelname = f"{robot.name}_{task.name}"
@@ -95,41 +159,10 @@ def camera_id(model: mujoco.MjModel, name: str) -> int:
     Raises:
         UnknownName: If there is no such camera.
     """
-    for prefix in ("", PREFIX):
-        camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, prefix + name)
-        if camera >= 0:
-            return camera
-    known = (model.camera(i).name.removeprefix(PREFIX) for i in range(model.ncam))
-    raise UnknownName("camera", name, known)
-
-
-def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
-    joints = [model.joint(PREFIX + name) for name in robot.joints]
-    arm_q = np.array([joint.qposadr[0] for joint in joints], dtype=np.int64)
-    objects = _objects(model)
-    gripper = Gripper(robot, model, PREFIX)
-    hulls = {
-        name: Hull(model, one.body, one.geom, robot.ee.lowest, gripper.most)
-        for name, one in objects.items()
-        if model.geom_type[one.geom] == int(mujoco.mjtGeom.mjGEOM_MESH)
-    }
-    return Scene(
-        robot=robot,
-        task=task,
-        model=model,
-        gripper=gripper,
-        actions=_action_space(robot, joints, gripper),
-        objects=objects,
-        arm_q=arm_q,
-        arm_ctrl=np.array(
-            [model.actuator(PREFIX + name).id for name in robot.joints], dtype=np.int64
-        ),
-        ee_site=model.site(PREFIX + "ee").id,
-        shoulder=joints[0].id,
-        yaws=_yaws(robot, model, joints, arm_q),
-        nominal=variation.nominal(model, objects),
-        hulls=hulls,
-    )
+    known = [model.camera(i).name.removeprefix(PREFIX) for i in range(model.ncam)]
+    if name not in known:
+        raise UnknownName("camera", name, known)
+    return known.index(name)
 
 
 def _yaws(
@@ -140,29 +173,27 @@ def _yaws(
     """
     if not robot.faces_ahead or not joints[-1].limited[0]:
         return -np.inf, np.inf
-    data, yaws = mujoco.MjData(model), []
-    for turn in (0.0, _TURN):
-        data.qpos[arm_q] = robot.home
-        data.qpos[arm_q[-1]] += turn
-        mujoco.mj_kinematics(model, data)
-        ee = data.site(PREFIX + "ee")
-        ahead = yaw_ahead(robot, data.xanchor[joints[0].id], ee.xpos)
-        yaws.append(math.remainder(angle_across(ee.xmat.reshape(3, 3)) - ahead, 2 * np.pi))
-    sign = np.sign(math.remainder(yaws[1] - yaws[0], 2 * np.pi))
-    ends = [yaws[0] + sign * (end - robot.home[-1]) for end in joints[-1].range]
+    data, last = mujoco.MjData(model), joints[-1]
+    data.qpos[arm_q] = robot.home
+    mujoco.mj_kinematics(model, data)
+    ee = data.site(PREFIX + "ee")
+    ahead = yaw_ahead(robot, data.xanchor[joints[0].id], ee.xpos)
+    yaw = math.remainder(angle_across(ee.xmat.reshape(3, 3)) - ahead, 2 * np.pi)
+    sign = np.sign(data.xaxis[last.id, 2])  # whether the joint turns the hand as a yaw does
+    ends = [yaw + sign * (end - robot.home[-1]) for end in last.range]
     return min(ends) + _SPARE_TURN, max(ends) - _SPARE_TURN
 
 
 def _objects(model: mujoco.MjModel) -> dict[str, Object]:
     """The free bodies, by name, in the model's order."""
-    objects = {}
-    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
-        body = int(model.jnt_bodyid[joint])
-        name, geom = model.body(body).name, int(model.body_geomadr[body])
-        objects[name] = Object(
-            name, body, geom, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    bodies = [model.body(model.jnt_bodyid[joint]) for joint in free]
+    return {
+        body.name: Object(body.name, body.id, *map(int, (*body.geomadr, *place)))
+        for body, *place in zip(
+            bodies, model.jnt_qposadr[free], model.jnt_dofadr[free], strict=True
         )
-    return objects
+    }
 
 
 def _check_objects(scene: Scene) -> None:
@@ -186,9 +217,7 @@ def _check_objects(scene: Scene) -> None:
             )
         # width between the fingers if the object lies on its worst side
         elif kind in variation.KINDS:
-            width = float(
-                np.sort(lengths)[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else lengths[0]
-            )
+            width = float(np.sort(lengths)[1])
             fits = width < most
         else:
             raise UsageError(
@@ -203,17 +232,16 @@ def _check_objects(scene: Scene) -> None:
 
 
 def _action_space(robot: Robot, joints: list[Any], gripper: Gripper) -> ActionSpace:
-    limits = np.array([joint.range if joint.limited[0] else [-np.inf, np.inf] for joint in joints])
-    low, high = np.vstack([limits, [gripper.least, gripper.most]]).T
+    limits = [joint.range if joint.limited[0] else [-np.inf, np.inf] for joint in joints]
+    low, high = np.vstack([*limits, [gripper.least, gripper.most]]).T
     scale = np.append(np.full(len(joints), robot.max_joint_step), gripper.most - gripper.least)
     relative, units = np.arange(len(scale)) < len(joints), None
     if robot.lerobot is not None:
         openings, driven = gripper.driven
-        units = ServoUnits(openings, robot.lerobot.percent(driven))
-        ends = np.sort(units.percents[[0, -1]])
-        low, high, scale = (np.degrees(one) for one in (low, high, scale))
-        low[-1], high[-1] = ends
-        scale[-1] = np.ptp(ends)
+        units = openings, robot.lerobot.percent(driven)
+        low, high, scale = np.degrees([low, high, scale])
+        low[-1], high[-1] = np.sort(units[1][[0, -1]])
+        scale[-1] = high[-1] - low[-1]
     return ActionSpace(robot.joint_names, low, high, scale, relative, units)
 
 
@@ -248,17 +276,13 @@ def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> N
     touching = (model.geom_contype | model.geom_conaffinity) > 0
     stand = next(geoms for geoms in (fixed & touching, fixed, touching) if geoms.any())
     placed = [outline(model, data, geom) for geom in np.flatnonzero(stand)]
-    middles = np.array([(one.max(axis=0) + one.min(axis=0))[:2] / 2 for one in placed])
+    x, y = np.mean([(one.max(axis=0) + one.min(axis=0))[:2] / 2 for one in placed], axis=0)
     lowest = min(float(one[:, 2].min()) for one in placed)
     floor = -robot.table.height
     height = lowest - 0.01 - floor
-    on_table = (
-        abs(lowest) < _ON_TABLE
-        and abs(middles[:, 0].mean() - _table_x(robot)) < robot.table.size[0] / 2
-    )
-    if height <= 0.02 or on_table:
+    over_table = abs(x - _table_x(robot)) < robot.table.size[0] / 2
+    if height <= 0.02 or (over_table and abs(lowest) < _ON_TABLE):
         return
-    x, y = middles.mean(axis=0)
     spec.worldbody.add_geom(
         name="pedestal",
         type=mujoco.mjtGeom.mjGEOM_BOX,

@@ -6,8 +6,7 @@ and units of `Condition`.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -24,7 +23,7 @@ GEOMS = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
 KINDS = {int(geom): kind for kind, geom in GEOMS.items()}
-_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 PER_OBJECT = 5
 _SIZE = slice(0, 3)
 _MASS = 3
@@ -38,8 +37,7 @@ for _quantity in RANGES.values():
 _NOT_PHYSICS = WORLD_SIZE - RANGES["posture"].places[0]
 
 
-@dataclass(frozen=True)
-class Object:
+class Object(NamedTuple):
     """A free body of a compiled model, and its first geom, which gives its shape.
 
     Attributes:
@@ -115,23 +113,24 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
             quantities change nothing.
     """
     varied = base.copy()
-    rows, world = _objects(varied), _world(varied)
-    if "shape" in drawn:
-        world[_SHAPE] = GEOMS[drawn["shape"]]
-    for row in rows:
+    world = _world(varied)
+    if kind := drawn.get("shape"):
+        world[_SHAPE] = GEOMS[kind]
+    for row in _objects(varied):
         width = 2 * float(row[_SIZE].max())
-        if "shape" in drawn:
-            shape = ObjectShape.of_width(drawn["shape"], drawn.get("size", width))
-            row[_SIZE], row[_MASS] = [*shape.size, *[0.0] * (3 - len(shape.size))], shape.mass
-        elif "size" in drawn:
-            row[_SIZE] *= drawn["size"] / width
-    for name, column in (("mass", _MASS), ("friction", _FRICTION)):
-        rows[:, column] = drawn.get(name, rows[:, column])
-    for name, value in drawn.items():
-        if name in RANGES:
-            world[RANGES[name].places] = np.ravel(
-                [value[camera] for camera in CAMERAS] if isinstance(value, dict) else value
-            )
+        size = drawn.get("size", width)
+        if kind:
+            shape = ObjectShape.of_width(kind, size)
+            row[:_FRICTION] = [*shape.size, 0.0, 0.0][:_MASS] + [shape.mass]
+        else:
+            row[_SIZE] *= size / width
+        row[_MASS] = drawn.get("mass", row[_MASS])
+        row[_FRICTION] = drawn.get("friction", row[_FRICTION])
+    for name in RANGES.keys() & drawn:
+        value = drawn[name]
+        if isinstance(value, dict):
+            value = np.concatenate([value[camera] for camera in CAMERAS])
+        world[RANGES[name].places] = value
     return varied
 
 
@@ -167,22 +166,18 @@ def apply(
 
 def _apply_object(changed: Any, plain: Any, one: Object, row: F64, shape: int | None) -> None:
     geom, body = one.geom, one.body
-    size = row[_SIZE]
-    mass = row[_MASS]
-    friction = row[_FRICTION]
-    kind = own = int(plain.geom_type[geom])
-    changed.geom_condim[geom], changed.geom_friction[geom] = (
-        plain.geom_condim[geom],
-        plain.geom_friction[geom],
-    )
+    size, (mass, friction) = row[_SIZE], row[_MASS:]
+    own = int(plain.geom_type[geom])
+    kind = own if shape is None else shape
+    for name in ("geom_condim", "geom_friction"):
+        getattr(changed, name)[geom] = getattr(plain, name)[geom]
     if shape is not None:
-        kind = shape
         changed.geom_condim[geom], changed.geom_friction[geom, 2] = contact(KINDS[shape])
     nodes = slice(plain.body_bvhadr[body], plain.body_bvhadr[body] + plain.body_bvhnum[body])
     like, at = plain, geom
     bounds = plain.bvh_aabb[nodes, 3:]
     inertia = plain.body_inertia[body] * (mass / plain.body_mass[body])
-    if own != _MESH and (kind != own or not np.array_equal(size, plain.geom_size[geom])):
+    if own != MESH and (kind != own or not np.array_equal(size, plain.geom_size[geom])):
         spec = mujoco.MjSpec()  # a body of one geom, for its inertia and bounds
         spec.worldbody.add_body().add_geom(type=mujoco.mjtGeom(kind), size=size, mass=mass)
         like, at = spec.compile(), 0

@@ -1,13 +1,21 @@
-"""The model that pictures are drawn from: a copy of the physics model with few faces, lit by a
-`Look`.
+"""The model that pictures are drawn from, and a window that shows it.
 
-One episode's drawn values are applied to it and undone for the next.
+The model is a copy of the physics model with few faces, lit by a `Look`. One episode's drawn values
+are applied to it and undone for the next. Software rendering costs time per triangle, and the
+Panda's meshes have 136,040 for an arm that is 60 pixels tall.
 
-Software rendering costs time per triangle, and the Panda's meshes have 136,040 for an arm that is
-60 pixels tall.
+The window is MuJoCo's own viewer, in real time, if there is a display. It shows a copy of the
+physics, too: changes in its panels do not affect the episode, except that callers can use the
+control sliders (`commands`) and the pull of the mouse (`pull`).
 """
 
+import atexit
+import contextlib
 import copy
+import os
+import threading
+import time
+import warnings
 from collections.abc import Sequence
 from functools import lru_cache
 from operator import attrgetter
@@ -17,12 +25,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.errors import RenderError
 from manip_il.mdp import F64
 from manip_il.robots.geometry import turn_about_z
-from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.scene import TABLE, camera_id
+from manip_il.sim.config import CAMERAS, FILM, Look
+from manip_il.sim.scene import SCENES_KEPT, STATE_KIND, TABLE, Scene, camera_id
 from manip_il.sim.variation import part, seen_objects
-from manip_il.sim.world import SCENES_KEPT, Scene
 
 Indices = NDArray[np.integer]
 _CELLS = 22  # grid cells along a mesh's diagonal: enough to look right at 480 x 640 pixels
@@ -36,17 +44,7 @@ _LAMPS = tuple(
     for lamp in ("light_", "vis.headlight.")
     for colour in ("ambient", "diffuse", "specular")
 )
-_CHANGED = (
-    "geom_type",
-    "geom_size",
-    "geom_matid",
-    "geom_rgba",
-    "cam_pos",
-    "cam_quat",
-    "light_pos",
-    "light_dir",
-    *_LAMPS,
-)
+_MOVED = ("cam_pos", "cam_quat", "light_pos", "light_dir")
 
 
 class ViewModel:
@@ -64,14 +62,16 @@ class ViewModel:
             look: Lighting.
             fine: Whether to keep every face of the meshes.
         """
-        self.model: Any = copy.copy(scene.model if fine else _with_few_faces(scene))
-        self.model.vis.quality.offsamples = 0  # the renderer smooths edges itself
+        model: Any = copy.copy(scene.model if fine else _with_few_faces(scene))
+        model.vis.quality.offsamples = 0  # the renderer smooths edges itself
         if not look.shadows:
-            self.model.vis.quality.shadowsize = 0
+            model.vis.quality.shadowsize = 0
+        self.model = model
         self._objects = [one.geom for one in scene.objects.values()]
-        self._table = [self.model.geom(TABLE).id]
+        self._lamps = attrgetter(*_LAMPS)(model)
         self._light(look.brightness, look.light_turn)
-        self._plain = {name: attrgetter(name)(self.model).copy() for name in _CHANGED}
+        changed = attrgetter("geom_type", "geom_size", "geom_matid", "geom_rgba", *_MOVED)(model)
+        self._plain = [(array, array.copy()) for array in (*changed, *self._lamps)]
         self._applied = scene.nominal
 
     def apply(self, variation: F64) -> None:
@@ -84,22 +84,25 @@ class ViewModel:
         """
         if np.array_equal(variation, self._applied):
             return
-        for name, plain in self._plain.items():
-            attrgetter(name)(self.model)[:] = plain
+        for array, plain in self._plain:
+            array[:] = plain
         sizes, kind = seen_objects(variation)
         self.model.geom_size[self._objects] = sizes
         if kind is not None:
             self.model.geom_type[self._objects] = kind
         self._paint(self._objects, part(variation, "colour"))
-        self._paint(self._table, part(variation, "table"))
+        self._paint([self.model.geom(TABLE).id], part(variation, "table"))
         shifts, turns = (
             part(variation, name).reshape(-1, 3) for name in ("camera_shift", "camera_turn")
         )
-        for moved in zip(CAMERAS, shifts, turns, strict=True):
-            self._move_camera(*moved)
-        self._light(
-            float(part(variation, "brightness")[0]), float(part(variation, "light_turn")[0])
-        )
+        for name, shift, turn in zip(CAMERAS, shifts, np.deg2rad(turns), strict=True):
+            camera, moved = camera_id(self.model, name), np.empty(3)
+            quat = self.model.cam_quat[camera]
+            mujoco.mju_rotVecQuat(moved, shift, quat)
+            self.model.cam_pos[camera] += moved
+            mujoco.mju_quatIntegrate(quat, turn, 1.0)
+        brightness, light_turn = part(variation, "brightness"), part(variation, "light_turn")
+        self._light(*brightness.tolist(), *light_turn.tolist())
         self._applied = variation.copy()
 
     def _paint(self, geoms: Sequence[int], colour: F64) -> None:
@@ -107,20 +110,12 @@ class ViewModel:
             self.model.geom_matid[geoms] = -1  # a material's colour would hide the geom's
             self.model.geom_rgba[geoms] = [*colour, 1.0]
 
-    def _move_camera(self, name: str, shift: F64, turn: F64) -> None:
-        """Move a camera [m], and turn it [deg], in its own frame."""
-        camera = camera_id(self.model, name)
-        quat, moved = self.model.cam_quat[camera], np.empty(3)
-        mujoco.mju_rotVecQuat(moved, shift, quat)
-        self.model.cam_pos[camera] += moved
-        mujoco.mju_quatIntegrate(quat, np.deg2rad(turn), 1.0)
-
     def _light(self, brightness: float, light_turn: float) -> None:
         """Multiply every lamp by a factor, and turn those fixed in the world about the vertical
         [deg].
         """
-        for name in _LAMPS:
-            attrgetter(name)(self.model)[:] *= brightness
+        for colour in self._lamps:
+            colour *= brightness
         rotation = turn_about_z(np.deg2rad(light_turn))
         in_world = self.model.light_bodyid == 0
         for vectors in (self.model.light_pos, self.model.light_dir):
@@ -141,28 +136,24 @@ def simplify_meshes(model: mujoco.MjModel, finest: float) -> None:
         model: The model, changed in place.
         finest: Least size of a grid cell [m].
     """
-    for mesh in range(model.nmesh):
-        if model.mesh_facenum[mesh] > _PLAIN_FACES:
-            _simplify(model, mesh, finest)
-
-
-def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
-    """Overwrite the start of a mesh's vertices, normals and faces with fewer.
-
-    The rest is never drawn.
-    """
-    vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
-    normals = model.mesh_normal[model.mesh_normaladr[mesh] :][: model.mesh_normalnum[mesh]]
-    faces, face_normals = (
-        rows[model.mesh_faceadr[mesh] :][: model.mesh_facenum[mesh]]
-        for rows in (model.mesh_face, model.mesh_facenormal)
-    )
-    normal_of = np.zeros(len(vertices), dtype=np.int64)
-    normal_of[faces] = face_normals
-    positions, originals, few = cluster(vertices.astype(np.float64), faces, finest)
-    vertices[: len(positions)], normals[: len(positions)] = positions, normals[normal_of[originals]]
-    faces[: len(few)] = face_normals[: len(few)] = few
-    model.mesh_facenum[mesh] = len(few)
+    for mesh in np.flatnonzero(model.mesh_facenum > _PLAIN_FACES):
+        vertices, normals, faces, face_normals = (
+            getattr(model, f"mesh_{rows}")[start:][:count]
+            for rows, start, count in (
+                ("vert", model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]),
+                ("normal", model.mesh_normaladr[mesh], model.mesh_normalnum[mesh]),
+                ("face", model.mesh_faceadr[mesh], model.mesh_facenum[mesh]),
+                ("facenormal", model.mesh_faceadr[mesh], model.mesh_facenum[mesh]),
+            )
+        )
+        normal_of = np.zeros(len(vertices), dtype=np.int64)
+        normal_of[faces] = face_normals
+        positions, originals, few = cluster(vertices.astype(np.float64), faces, finest)
+        # Their start is overwritten; the rest is never drawn.
+        vertices[: len(positions)] = positions
+        normals[: len(positions)] = normals[normal_of[originals]]
+        faces[: len(few)] = face_normals[: len(few)] = few
+        model.mesh_facenum[mesh] = len(few)
 
 
 def cluster(
@@ -192,7 +183,11 @@ def cluster(
     moves *= size / np.maximum(np.linalg.norm(moves, axis=1, keepdims=True), size)
     by_distance = np.lexsort([np.linalg.norm(vertices - means[cell], axis=1), cell])
     originals = by_distance[np.cumsum(counts) - counts]
-    return means + moves, originals, _distinct(cell[faces])
+    # faces with three different corners, each once, in their winding
+    merged = cell[faces]
+    merged = merged[(merged != np.roll(merged, 1, axis=1)).all(axis=1)]
+    turned = (merged.argmin(axis=1)[:, None] + [0, 1, 2]) % 3
+    return means + moves, originals, np.unique(np.take_along_axis(merged, turned, 1), axis=0)
 
 
 def _flattest(vertices: F64, faces: Indices, cell: Indices, means: F64) -> F64:
@@ -217,16 +212,139 @@ def _flattest(vertices: F64, faces: Indices, cell: Indices, means: F64) -> F64:
     )[:, :, 0]
 
 
-def _distinct(faces: Indices) -> Indices:
-    """The faces with three different corners, each once, in their winding."""
-    first, second, third = faces.T
-    faces = faces[(first != second) & (second != third) & (third != first)]
-    turned = (faces.argmin(axis=1)[:, None] + [0, 1, 2]) % 3
-    return np.unique(np.take_along_axis(faces, turned, axis=1), axis=0)
-
-
 def _sums(groups: Indices, values: F64, count: int) -> F64:
     """Sums of the rows of each group, (count, d)."""
     sums = np.zeros((count, values.shape[1]))
     np.add.at(sums, groups, values)
     return sums
+
+
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of X11 and Wayland
+# initial camera: target's height [m], [m], [deg]
+_LOOK_AT = 0.15
+_DISTANCE = 1.9
+_AZIMUTH = 140.0
+_ELEVATION = -25.0
+_CLOSING = 5.0  # longest wait for each of the viewer's threads [s]
+
+
+def has_display() -> bool:
+    """Return whether an environment variable names a display."""
+    return any(os.environ.get(name) for name in DISPLAYS)
+
+
+def require_display() -> None:
+    """Check that a window can be opened.
+
+    Without this, MuJoCo's viewer would end the process, or wait forever.
+
+    Raises:
+        RenderError: If no window can be opened.
+    """
+    import glfw  # MuJoCo's own
+
+    with warnings.catch_warnings(action="ignore"):  # glfw warns if there is no display
+        opened = has_display() and glfw.init()
+    if not opened:
+        named = ", ".join(f"{name}={os.environ.get(name, '')}" for name in DISPLAYS)
+        raise RenderError(
+            f'no display: {named}; use render_mode="rgb_array", or manip-il view --output=FILE.rrd'
+        )
+
+
+class Clock:
+    """Paces control steps in real time."""
+
+    def __init__(self, hz: float):
+        self._step, self._due = 1 / hz, 0.0
+
+    def wait(self) -> None:
+        """Wait until a control step has passed since the last call returned.
+
+        Return at once if it already has.
+        """
+        now = time.monotonic()
+        self._due = max(self._due + self._step, now)
+        time.sleep(self._due - now)
+
+
+class Window:
+    """A window that shows a scene in real time."""
+
+    def __init__(self, scene: Scene, control_hz: float, *, sliders: bool = False):
+        """Open the window.
+
+        Args:
+            scene: The scene.
+            control_hz: How often per second `show` is called.
+            sliders: Whether to open the right panel, which has the control sliders.
+
+        Raises:
+            RenderError: If there is no display.
+        """
+        require_display()
+        import mujoco.viewer
+
+        self._view = ViewModel(scene, FILM, fine=True)
+        self._model, self._data = self._view.model, mujoco.MjData(self._view.model)
+        self._state = np.empty(mujoco.mj_stateSize(self._model, STATE_KIND))
+        self._clock = Clock(control_hz)
+        others = threading.enumerate()
+        self._handle: Any = mujoco.viewer.launch_passive(
+            self._model, self._data, show_left_ui=False, show_right_ui=sliders
+        )
+        self._threads = [one for one in threading.enumerate() if one not in others]
+        # before MuJoCo's own handlers, which do not wait for its threads and may crash
+        atexit.register(self.close)
+        with self._handle.lock():
+            camera = self._handle.cam
+            camera.lookat[:] = [*scene.robot.workspace.centre, _LOOK_AT]
+            camera.distance = _DISTANCE
+            camera.azimuth = _AZIMUTH
+            camera.elevation = _ELEVATION
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the window is open: false once the user has closed it."""
+        return self._handle.is_running()
+
+    def show(self, data: mujoco.MjData, variation: F64, text: str = "") -> None:
+        """Show the physics, then wait for real time; do nothing if the window is closed.
+
+        Args:
+            data: The scene's data.
+            variation: The world's variation, (v,), whose look is shown.
+            text: Text shown in the upper left.
+        """
+        if not self.is_open:
+            return
+        with self._handle.lock():
+            self._view.apply(variation)
+            mujoco.mj_getState(self._model, data, self._state, STATE_KIND)
+            mujoco.mj_setState(self._model, self._data, self._state, STATE_KIND)
+            mujoco.mj_forward(self._model, self._data)
+        with contextlib.suppress(mujoco.UnexpectedError):  # closed meanwhile
+            if text:
+                self._handle.set_texts((None, None, text, ""))
+            self._handle.sync()
+        self._clock.wait()
+
+    @property
+    def commands(self) -> F64:
+        """Positions of the control sliders, in the actuators' units, (u,).
+
+        They are as shown last, or as moved since.
+        """
+        return self._data.ctrl.copy()
+
+    def pull(self, data: mujoco.MjData) -> None:
+        """Apply the mouse's pull on a body [N] to `data`, until the next call."""
+        data.xfrc_applied[:] = 0.0
+        mujoco.mjv_applyPerturbForce(self._model, data, self._handle.perturb)
+
+    def close(self) -> None:
+        """Close the window and wait until it is gone; a second call changes nothing."""
+        atexit.unregister(self.close)
+        self._handle.close()
+        for one in self._threads:
+            one.join(_CLOSING)

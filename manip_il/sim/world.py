@@ -7,33 +7,24 @@ from the robot.
 import copy
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, NoReturn
 
 import mujoco
 import numpy as np
 
-from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import F64, I64
-from manip_il.robots.action_space import ActionSpace
 from manip_il.robots.geometry import angle_across, angle_ahead, angle_from_down, off_yaw, yaw_ahead
-from manip_il.robots.gripper import Gripper
 from manip_il.robots.reach import Reach, reach_of
-from manip_il.robots.robot import Robot
 from manip_il.sim import variation as variations
 from manip_il.sim.rests import Hull
-from manip_il.sim.shape import ANY
-from manip_il.sim.variation import Object
+from manip_il.sim.scene import STATE_KIND, Scene
 
-STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 # heights and distance at which a hand may hit a neighbour of an object [m]
 _BESIDE, _NEAR = (-0.02, 0.07), 0.08
 _MOST_TURNS = 4  # symmetric turns tried in each direction
 _AT_REST = 0.03, 0.5  # speeds below which an object is at rest [m/s], [rad/s]
-# scenes cached per process, and what is computed from one: the finest meshes take 64 MB
-SCENES_KEPT = 4
-USUAL = 0.15  # half width of Panda's workspace [m]
 GOAL = "goal"  # the mocap body that marks the goal
 
 
@@ -42,68 +33,6 @@ class Pose(NamedTuple):
 
     position: F64
     rotation: F64
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """A robot and a task's objects as one compiled model, and the addresses of its named parts.
-
-    Attributes:
-        robot: The robot.
-        task: The `Task`.
-        model: The compiled model.
-        gripper: The robot's gripper in the model.
-        actions: Names and bounds of actions.
-        objects: Free bodies, by name.
-        arm_q: Indices of the arm's joints into `qpos`, (arm,).
-        arm_ctrl: Indices of the arm's actuators into `ctrl`, (arm,).
-        ee_site: Id of the site `ee`.
-        shoulder: Id of the arm's first joint.
-        yaws: Least and greatest yaw of the hand, relative to `World.ahead` [rad].
-        nominal: The variation of the model as compiled, (v,).
-        hulls: Convex hulls, by name, of the objects that are meshes.
-    """
-
-    robot: Robot
-    task: Any
-    model: mujoco.MjModel
-    gripper: Gripper
-    actions: ActionSpace
-    objects: Mapping[str, Object]
-    arm_q: I64
-    arm_ctrl: I64
-    ee_site: int
-    shoulder: int
-    yaws: tuple[float, float]
-    nominal: F64
-    hulls: Mapping[str, Hull]
-
-    @cached_property
-    def state_size(self) -> int:
-        """Length of `State.physics`."""
-        return mujoco.mj_stateSize(self.model, STATE_KIND)
-
-    @cached_property
-    def draws_shape(self) -> bool:
-        """Whether each episode draws the shape of the object; the model as compiled has a cube."""
-        return self.task.shape.kind == ANY
-
-    @cached_property
-    def scale(self) -> float:
-        """Width of the workspace as a share of Panda's, at most 1."""
-        return min(1.0, self.robot.workspace.half_width / USUAL)
-
-    @cached_property
-    def furniture(self) -> I64:
-        """Ids of the geoms of mocap bodies, (g,): goal markers and the fixed parts of the task."""
-        return np.flatnonzero(
-            self.model.body_mocapid[self.model.body_rootid[self.model.geom_bodyid]] >= 0
-        )
-
-    @property
-    def name(self) -> str:
-        """Robot and task, for messages."""
-        return f"{self.robot.name} {self.task.name}"
 
 
 class World:
@@ -151,14 +80,7 @@ class World:
 
         Args:
             variation: The variation, (v,).
-
-        Raises:
-            MismatchError: If the variation has another length than the scene's.
         """
-        if len(variation) != (size := len(self.scene.nominal)):
-            raise MismatchError(
-                "size of the variation", "the state", len(variation), "the scene", size
-            )
         if variation.tobytes() == self.variation.tobytes():
             return
         self._cache.clear()
@@ -191,11 +113,9 @@ class World:
         Raises:
             MismatchError: If the state is one of another scene.
         """
-        size = self.scene.state_size
-        if len(physics) != size:
-            raise MismatchError(
-                "size of the physics state", "the state", len(physics), self.scene.name, size
-            )
+        given = len(physics), len(variation)
+        if given != (sizes := (self.scene.state_size, len(self.scene.nominal))):
+            raise MismatchError("size of a state", "it", given, self.scene.name, sizes)
         self.vary(variation)
         mujoco.mj_setState(self.model, self.data, physics, STATE_KIND)
         self.update()
@@ -214,7 +134,7 @@ class World:
             quaternion: Its rotation in the world, wxyz, (4,).
 
         Raises:
-            UnknownName: If there is no body of this name.
+            KeyError: If there is no body of this name.
             ManipError: If it is neither an object nor a mocap body.
         """
         if name in self.scene.objects:
@@ -222,7 +142,7 @@ class World:
             self.data.qpos[placed.q : placed.q + 7] = [*position, *quaternion]
             self.data.qvel[placed.v : placed.v + 6] = 0.0
             return
-        mocap = int(self._body(name).mocapid[0])
+        mocap = int(self.scene.model.body(name).mocapid[0])
         if mocap < 0:
             raise ManipError(f"{name!r} is neither an object nor a mocap body; it cannot be placed")
         self.data.mocap_pos[mocap], self.data.mocap_quat[mocap] = position, quaternion
@@ -242,11 +162,11 @@ class World:
             name: Name of the body.
 
         Raises:
-            UnknownName: If there is no body of this name.
+            KeyError: If there is no body of this name.
         """
         pose = self._poses.get(name)
         if pose is None:
-            body = self._body(name).id
+            body = self.scene.model.body(name).id
             pose = self._poses[name] = Pose(
                 self.data.xpos[body], self.data.xmat[body].reshape(3, 3)
             )
@@ -289,11 +209,8 @@ class World:
         """
         low, high = self.scene.yaws
         off = math.remainder(yaw - self.ahead(position), alike)
-        ways = (
-            [off + turn * alike for turn in range(-_MOST_TURNS, _MOST_TURNS + 1)]
-            if math.isfinite(low)
-            else [off]
-        )
+        most = _MOST_TURNS if math.isfinite(low) else 0
+        ways = [off + turn * alike for turn in range(-most, most + 1)]
         return [way for way in ways if low <= way <= high] or [off]
 
     def turned(self, position: F64) -> float:
@@ -377,24 +294,14 @@ class World:
     def _standing(self) -> Mapping[str, I64]:
         """For each object, the geoms of furniture and of the other objects."""
         objects, furniture = self.scene.objects, self.scene.furniture
-        furniture = furniture[self.scene.model.geom_contype[furniture] > 0]
+        solid = furniture[self.scene.model.geom_contype[furniture] > 0].tolist()
+        geoms = {name: one.geom for name, one in objects.items()}
         return {
-            name: (
-                np.append(
-                    furniture, [objects[other].geom for other in objects if other != name]
-                ).astype(np.int64)
-            )
-            for name in objects
+            name: np.array(solid + [geoms[other] for other in geoms if other != name], np.int64)
+            for name in geoms
         }
 
     @cached_property
     def reach(self) -> Reach:
         """Map of the points that the downward hand reaches."""
         return reach_of(self.robot)
-
-    def _body(self, name: str) -> Any:
-        try:
-            return self.scene.model.body(name)
-        except KeyError:
-            known = (self.scene.model.body(number).name for number in range(self.scene.model.nbody))
-            raise UnknownName("body", name, known) from None

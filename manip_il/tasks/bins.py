@@ -11,7 +11,7 @@ from manip_il.sim.task import Rung, Target
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of
 from manip_il.tasks.ladder import LiftProfile, Place, Which, carry, hand_is_at, is_held, let_go
-from manip_il.tasks.objects import WOOD, add_furniture, add_part
+from manip_il.tasks.objects import WOOD, Colour, add_furniture, add_part, add_sides
 
 WALL, THIN = 0.05, 0.003  # height of a box, half the thickness of walls and floor [m]
 DROP = 0.02  # height of an object's bottom over a box's floor at release [m]
@@ -25,7 +25,7 @@ _RISE = 0.10  # height of the hand over an object after release [m]
 
 
 def add_bin(
-    spec: mujoco.MjSpec, name: str, inside: tuple[float, float], colour: tuple[float, ...] = WOOD
+    spec: mujoco.MjSpec, name: str, inside: tuple[float, float], colour: Colour = WOOD
 ) -> None:
     """Add an open box, whose pose is set at the start of an episode.
 
@@ -40,8 +40,7 @@ def add_bin(
     x, y = length + THIN, width + THIN
     across, along = (length + 2 * THIN, THIN, high), (THIN, width, high)
     add_part(box, f"{name} floor", (length, width, THIN), (0, 0, THIN), colour)
-    add_part(box, f"{name} left", across, (0, y, high), colour)
-    add_part(box, f"{name} right", across, (0, -y, high), colour)
+    add_sides(box, name, across, (0, y, high), colour)
     add_part(box, f"{name} far", along, (x, 0, high), colour)
     add_part(box, f"{name} near", along, (-x, 0, high), colour)
 

@@ -1,7 +1,7 @@
 """Clear the table: put four cubes into a box."""
 
 import math
-from collections.abc import Sequence
+from functools import partial
 from itertools import product
 
 import mujoco
@@ -22,10 +22,8 @@ from manip_il.tasks.bins import (
 )
 from manip_il.tasks.grasp import once_per_state
 from manip_il.tasks.ladder import carry_progress, grasp_progress, grasp_rungs, is_held
-from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
-from manip_il.tasks.pick_place import observe_object
-from manip_il.tasks.reach import observe_hand
-from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_together, draw_yaw
+from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, observe_hand, observe_object
+from manip_il.tasks.starts import UPRIGHT, draw_few, draw_resting, draw_until, draw_yaw
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW, "white": (0.92, 0.92, 0.90)}
 BOX = "box"
@@ -92,23 +90,30 @@ class ClearTable(Task):
         """Add the cubes and the box."""
         for name, colour in COLOURS.items():
             add_cube(spec, name, HALF, 0.05, colour)
-        add_bin(spec, BOX, INSIDE, WOOD)
+        add_bin(spec, BOX, INSIDE)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw the box's side, and the cubes on the table, apart and at any yaw."""
         x, y = world.robot.workspace.centre
         box = np.array([x + rng.uniform(-0.03, 0.03), y + rng.choice([-1.0, 1.0]) * SIDE, 0.0])
 
-        def fits(at: F64, others: Sequence[F64]) -> bool:
-            return abs(at[1] - box[1]) > FROM_BOX and all(
-                math.dist(at, other) > APART for other in others
-            )
+        def draw_cubes() -> dict[str, F64]:
+            places: dict[str, F64] = {}
 
-        places = draw_together(
-            lambda name: draw_resting(rng, world, name, ROOM), COLOURS, fits, world
-        )
-        cubes = {name: (at, draw_yaw(rng)) for name, at in zip(COLOURS, places, strict=True)}
-        return Start({BOX: (box, UPRIGHT), **cubes})
+            def fits(at: F64) -> bool:
+                apart = all(math.dist(at, other) > APART for other in places.values())
+                return abs(at[1] - box[1]) > FROM_BOX and apart
+
+            for name in COLOURS:
+                at = draw_few(partial(draw_resting, rng, world, name, ROOM), fits)
+                if at is None:
+                    return {}
+                places[name] = at
+            return places
+
+        cubes = draw_until(draw_cubes, bool, world, ", ".join(COLOURS))
+        poses = {name: (at, draw_yaw(rng)) for name, at in cubes.items()}
+        return Start({BOX: (box, UPRIGHT), **poses})
 
     def observe(self, world: World) -> Observed:
         """Return the hand, the box, the next cube and the vector to its place, and all cubes.
@@ -119,13 +124,10 @@ class ClearTable(Task):
         return {
             **observe_hand(world),
             BOX: world.at(BOX),
-            **{
-                key.replace(name, "next", 1): value
-                for key, value in observe_object(world, name).items()
-            },
+            **observe_object(world, name, "next"),
             "place_from_next": _to(world) - world.at(name),
-            **{one: world.at(one) for one in COLOURS},
-            **{f"{one}.in_box": float(_inside(world, one)) for one in COLOURS},
+            **{cube: world.at(cube) for cube in COLOURS},
+            **{f"{cube}.in_box": float(_inside(world, cube)) for cube in COLOURS},
         }
 
     def error(self, world: World) -> float:

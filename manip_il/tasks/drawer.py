@@ -1,6 +1,7 @@
 """Drawer: open it by its handle, put the object in, close it."""
 
 import math
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -22,9 +23,16 @@ from manip_il.tasks.ladder import (
     nearness,
     rise_first,
 )
-from manip_il.tasks.objects import GREY, WOOD, add_cube, add_furniture, add_part
-from manip_il.tasks.pick_place import OBJECT, observe_object
-from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.objects import (
+    GREY,
+    add_cube,
+    add_furniture,
+    add_part,
+    add_sides,
+    observe_hand,
+    observe_object,
+)
+from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw
 
 CABINET = "cabinet"
@@ -84,42 +92,31 @@ def add_cabinet(spec: mujoco.MjSpec) -> None:
     deep, wide = length + 2 * THIN, width + 3 * THIN  # half the cabinet's depth and width
     back = front + 2 * deep
     whole = wide + 2 * THIN
-    for side, y in (("left", wide + THIN), ("right", -(wide + THIN))):
-        add_part(
-            cabinet, f"cabinet {side}", (deep, THIN, ROOF / 2), (front + deep, y, ROOF / 2), WOOD
-        )
-    add_part(cabinet, "cabinet back", (THIN, whole, ROOF / 2), (back + THIN, 0, ROOF / 2), WOOD)
-    add_part(
-        cabinet,
-        "cabinet top",
-        (deep + THIN, whole, THIN),
-        (front + deep + THIN, 0, ROOF + THIN),
-        WOOD,
-    )
+    add_sides(cabinet, "cabinet", (deep, THIN, ROOF / 2), (front + deep, wide + THIN, ROOF / 2))
+    add_part(cabinet, "cabinet back", (THIN, whole, ROOF / 2), (back + THIN, 0, ROOF / 2))
+    top = (front + deep + THIN, 0, ROOF + THIN)
+    add_part(cabinet, "cabinet top", (deep + THIN, whole, THIN), top)
     tray = cabinet.add_body(name=TRAY)
     tray.add_joint(
         name=TRAY, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-1, 0, 0], limited=True, range=[0, OPEN],
         damping=[5.0, 0, 0], frictionloss=0.5, armature=0.05,
     )  # fmt: skip
     middle = front + length
-    add_part(tray, "drawer floor", (length, width, THIN), (middle, 0, FLOOR - THIN), WOOD)
-    for side, y in (("left", width + THIN), ("right", -(width + THIN))):
-        add_part(tray, f"drawer {side}", (length, THIN, WALL / 2), (middle, y, WALL / 2), WOOD)
+    add_part(tray, "drawer floor", (length, width, THIN), (middle, 0, FLOOR - THIN))
+    add_sides(tray, "drawer", (length, THIN, WALL / 2), (middle, width + THIN, WALL / 2))
     # so high that nothing gets behind it
     back_z, back_half = (ROOF - THIN + FLOOR) / 2, (ROOF - THIN - FLOOR) / 2
-    add_part(
-        tray, "drawer back", (THIN, width, back_half), (front + 2 * length + THIN, 0, back_z), WOOD
-    )
-    add_part(tray, "drawer front", (THIN, whole, PANEL / 2), (GAP + THIN, 0, PANEL / 2), WOOD)
+    back = (front + 2 * length + THIN, 0, back_z)
+    add_part(tray, "drawer back", (THIN, width, back_half), back)
+    add_part(tray, "drawer front", (THIN, whole, PANEL / 2), (GAP + THIN, 0, PANEL / 2))
     add_part(tray, BAR, (BAR_HALF, BAR_LENGTH, BAR_HALF), (0, 0, BAR_Z), GREY)
-    for side, y in (("left", BAR_LENGTH), ("right", -BAR_LENGTH)):
-        add_part(tray, f"{BAR} {side}", (GAP / 2, BAR_HALF, BAR_HALF), (GAP / 2, y, BAR_Z), GREY)
+    add_sides(tray, BAR, (GAP / 2, BAR_HALF, BAR_HALF), (GAP / 2, BAR_LENGTH, BAR_Z), GREY)
     spec.add_exclude(bodyname1=CABINET, bodyname2=TRAY)
 
 
 def pulled(world: World) -> float:
     """Return how far the drawer is open [m]."""
-    return float(world.at(CABINET)[0] - world.at(TRAY)[0])
+    return world.at(CABINET)[0] - world.at(TRAY)[0]
 
 
 def middle_of_drawer(world: World) -> F64:
@@ -134,7 +131,7 @@ def hand_at_handle(world: World) -> F64:
 
 def is_in_drawer(world: World) -> bool:
     """Return whether the object is in the drawer."""
-    x, y, z = (world.at(OBJECT) - middle_of_drawer(world)).tolist()
+    x, y, z = world.at(OBJECT) - middle_of_drawer(world)
     return abs(x) < INSIDE[0] and abs(y) < INSIDE[1] and z < WALL + 0.01
 
 
@@ -150,7 +147,7 @@ def _yaw(world: World) -> float:
 
 
 def _at_bar(world: World) -> bool:
-    is_near = is_inside((world.ee.position - hand_at_handle(world)).tolist(), AROUND)
+    is_near = is_inside(world.ee.position - hand_at_handle(world), AROUND)
     angle = angle_from_down(world.ee.rotation, _yaw(world))
     return is_near and angle < AROUND_ANGLE and world.opening < FINGERS + SPARE
 
@@ -178,16 +175,8 @@ def _move_drawer(world: World, to: float) -> Target:
     )
 
 
-def _push(world: World) -> Target:
-    return _move_drawer(world, -0.01)
-
-
 def _let_go(world: World) -> Target:
     return let_go(world, OBJECT, HOVER)
-
-
-def _is_shut(world: World) -> bool:
-    return pulled(world) < SHUT
 
 
 def _is_open(world: World) -> bool:
@@ -211,7 +200,7 @@ def _leave(world: World) -> Target:
 
 
 def _is_around_bar(world: World) -> bool:
-    x, y, z = (world.ee.position - hand_at_handle(world)).tolist()
+    x, y, z = world.ee.position - hand_at_handle(world)
     return abs(x) < LEFT[0] and abs(y) < LEFT[1] and z < LEFT[2]
 
 
@@ -229,7 +218,7 @@ def _must_shut(world: World) -> bool:
     """Whether to shut the drawer first: the object lies in its way, in front of the closed
     handle.
     """
-    return _is_in_way(world, BEFORE) and not _is_shut(world)
+    return _is_in_way(world, BEFORE) and pulled(world) >= SHUT
 
 
 def _must_open(world: World) -> bool:
@@ -252,6 +241,14 @@ def _put_aside(world: World) -> Target:
     return carry(world, OBJECT, to, OVER_TABLE)
 
 
+def _move_rungs(name: str, holds: Callable[[World], bool], to: float) -> tuple[Rung, ...]:
+    """Rungs that go to the handle and move the drawer until it is open by `to` [m]."""
+    return (
+        Rung(name, lambda w: holds(w) and _at_bar(w), lambda w: _move_drawer(w, to)),
+        Rung(f"to_{name}", holds, _to_bar),
+    )
+
+
 class Drawer(Task):
     """Open a drawer, put a cube in it, close it."""
 
@@ -263,10 +260,9 @@ class Drawer(Task):
     grasped = (OBJECT,)
     sizes = (0.03, 0.045)
     rungs = (
-        Rung("done", lambda w: is_in_drawer(w) and _is_shut(w), _to_bar),
+        Rung("done", lambda w: is_in_drawer(w) and pulled(w) < SHUT, _to_bar),
         Rung("let_go", lambda w: is_in_drawer(w) and _hand_is_in(w), _let_go),
-        Rung("push", lambda w: is_in_drawer(w) and _at_bar(w), _push),
-        Rung("to_push", is_in_drawer, _to_bar),
+        *_move_rungs("push", is_in_drawer, -0.01),
         Rung(
             "carry",
             lambda w: is_held(w, OBJECT) and _is_open(w),
@@ -274,10 +270,8 @@ class Drawer(Task):
         ),
         Rung("set_down", lambda w: is_held(w, OBJECT) and _is_set_down(w), _let_go),
         Rung("put_aside", lambda w: is_held(w, OBJECT), _put_aside),
-        Rung("make_way", lambda w: _must_shut(w) and _at_bar(w), _push),
-        Rung("to_make_way", _must_shut, _to_bar),
-        Rung("pull", lambda w: _must_open(w) and _at_bar(w), lambda w: _move_drawer(w, OPEN)),
-        Rung("to_pull", _must_open, _to_bar),
+        *_move_rungs("make_way", _must_shut, -0.01),
+        *_move_rungs("pull", _must_open, OPEN),
         Rung("leave", _is_around_bar, _leave),
         *grasp_rungs(lambda w: OBJECT, OVER),
     )
@@ -319,17 +313,15 @@ class Drawer(Task):
 
         This is the distance from the drawer's middle, or 0 if the object is inside.
         """
-        missing = (
-            0.0 if is_in_drawer(world) else math.dist(world.at(OBJECT), middle_of_drawer(world))
-        )
-        return max(0.0, pulled(world)) + missing
+        off = math.dist(world.at(OBJECT), middle_of_drawer(world))
+        return max(0.0, pulled(world)) + (0.0 if is_in_drawer(world) else off)
 
     def progress(self, world: World) -> float:
         """Return progress of opening the drawer, putting the object in and closing it."""
         opened = share(pulled(world) / OPEN)
         at_handle = nearness(math.dist(world.ee.position, hand_at_handle(world)))
         if is_in_drawer(world):
-            if _is_shut(world):
+            if pulled(world) < SHUT:
                 return 1.0
             return 0.75 if _hand_is_in(world) else 0.8 + 0.05 * at_handle + 0.15 * (1 - opened)
         if is_held(world, OBJECT) and _is_open(world):

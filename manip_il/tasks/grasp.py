@@ -38,22 +38,23 @@ MAX_TILT = 0.3  # tilt of the object off a face above which the hand waits over 
 # bounds on the object's centre in the ee frame, x y z, once the fingers close [m]
 CLOSING = (0.022, 0.015, 0.022)
 LEAN = 0.5  # lean of a hand at full stretch [rad]
-_MIDDLE = (0.0, 0.0, 0.0)
 _QUARTER = math.pi / 2
-_HALF_TURNS = (0.0, -math.pi, math.pi)
 _BOX, _SPHERE = int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_SPHERE)
 
 
-Way = tuple[float, float, float]
+_MIDDLE = (0.0, 0.0, 0.0)
+
+# A way to grasp an object: the yaw of a downward hand [rad], the object's width between the fingers
+# and its length across them [m], and the vector from its centre to the middle between them, (3,)
+# [m]. A plain tuple, since every label makes some.
+Candidate = tuple[float, float, float, Sequence[float]]
 
 
 class Lie(NamedTuple):
-    """Ways to grasp an object as it lies.
+    """How an object lies, and the ways to grasp it.
 
     Attributes:
-        grasps: For each way, the yaw of a downward hand [rad], the object's width between the
-            fingers and length across them [m], and the vector from its centre to the middle between
-            them, (3,) [m].
+        grasps: The ways to grasp it.
         tall: The object's height [m].
         tilt: The angle to its nearest resting pose [rad].
         folds: The number of its yaws that look alike, 0 if all do.
@@ -63,7 +64,7 @@ class Lie(NamedTuple):
         fits: Whether the gripper can close around it, if that was checked.
     """
 
-    grasps: tuple[tuple[float, float, float, Way], ...]
+    grasps: Sequence[Candidate]
     tall: float
     tilt: float
     folds: int
@@ -100,14 +101,14 @@ class Grasp(NamedTuple):
         lean: How much the hand leans to reach it, 0 to 1.
     """
 
-    offset: tuple[float, float, float]
+    offset: Sequence[float]
     width: float
     length: float
     half: float
     settled: bool
     yaw: float
     angle: float
-    at: tuple[float, float, float]
+    at: Sequence[float]
     wide: float
     open_enough: bool
     off: float
@@ -139,50 +140,49 @@ def once_per_state[F: Callable[..., Any]](compute: F) -> F:
 def lie_of(world: World, name: str) -> Lie:
     """Return the ways to grasp an object as it lies."""
     rotation, hull = world.pose(name).rotation, world.hull(name)
-    return (
-        _lie(world.kind(name), rotation, world.extents(name))
-        if hull is None
-        else _hull_lie(hull, rotation)
-    )
+    if hull is not None:
+        return _hull_lie(hull, rotation)
+    kind, extents = world.kind(name), world.extents(name)
+    if kind == _BOX:
+        return _box_lie(rotation, extents)
+    width, _, length = extents
+    ahead, left, up = rotation[:, 2].tolist()
+    if kind == _SPHERE or abs(up) > math.sqrt(0.5):
+        tilt = 0.0 if kind == _SPHERE else math.acos(min(1.0, abs(up)))
+        return Lie([(0.0, width, width, _MIDDLE)], length, tilt, 0)
+    grasps = _half_turns(math.atan2(left, ahead), (width, length), _MIDDLE)
+    return Lie(grasps, width, math.asin(abs(up)), 2)
 
 
 @once_per_state
 def grasp_of(world: World, name: str) -> Grasp:
     """Return the best grasp of an object from the hand's present pose."""
-    ee = world.ee
-    position = world.at(name)
-    lie = lie_of(world, name)
-    neighbours = world.neighbours(name)
-    yaw, width, length, (off_x, off_y, off_z) = _nearest(
-        lie, world, position, world.gripper.most - LEAST_ROOM, neighbours
-    )
-    x, y, z = position.tolist()
-    x = x + off_x
-    y = y + off_y
-    z = z + off_z
-    lean = 0.0 if world.robot.leans else world.reach.lean((x, y, z))
-    angle = _beyond_lean(world.off_down(yaw), ee.rotation, lean)
+    ee, gripper = world.ee, world.gripper
+    lie, neighbours = lie_of(world, name), world.neighbours(name)
+    yaw, width, length, centre = _nearest(world, world.at(name), lie, neighbours)
+    x, y, z = (world.at(name) + centre).tolist()
     ee_x, ee_y, ee_z = ee.position.tolist()
-    dx = x - ee_x
-    dy = y - ee_y
-    dz = z - ee_z
-    # offset of the object for one moving jaw [m]
-    aside = world.gripper.middle(width + 2 * BESIDE_JAW)
-    at_x, at_y = x - aside * math.sin(yaw), y + aside * math.cos(yaw)
-    room = max(0.0, world.gripper.most - width)  # clearance of the open gripper [m]
-    free = min(ANGLE_FREE, TIGHT * room / width)
-    way = at_x - ee_x, at_y - ee_y
+    offset = [
+        a * (x - ee_x) + b * (y - ee_y) + c * (z - ee_z) for a, b, c in ee.rotation.T.tolist()
+    ]
+    offset[1] -= gripper.middle(width)
+    lean = 0.0 if world.robot.leans else world.reach.lean((x, y, z))
+    angle, may_lean = world.off_down(yaw), min(angle_off_vertical(ee.rotation), lean * LEAN)
+    angle = math.sqrt(max(0.0, angle * angle - may_lean * may_lean))
     half = lie.tall / 2 if lie.above is None else lie.above
-    away = math.hypot(*(_beside_jaw(*way, yaw, -dz < half) if world.gripper.lopsided else way))
-    off = away + ANGLE_AS_LENGTH * max(0.0, angle - free)
+    # offset of the object for one moving jaw [m]
+    aside = gripper.middle(width + 2 * BESIDE_JAW)
+    at_x, at_y = x - aside * math.sin(yaw), y + aside * math.cos(yaw)
+    way, radius = (at_x - ee_x, at_y - ee_y), FUNNEL_RADIUS
+    crowding = _crowding(yaw, gripper.most, neighbours)
+    if gripper.lopsided:
+        way, radius = _beside_jaw(*way, yaw, around=ee_z - z < half), BY_JAW
+        crowding = 1.0
+    room = max(0.0, gripper.most - width)  # clearance of the open gripper [m]
+    free = min(ANGLE_FREE, TIGHT * room / width)
+    off = math.hypot(*way) + ANGLE_AS_LENGTH * max(0.0, angle - free)
     slope = FUNNEL_STEEP if neighbours else FUNNEL_SLOPE
-    funnel = slope * max(
-        0.0, off - min(BY_JAW if world.gripper.lopsided else FUNNEL_RADIUS, TIGHT * room)
-    )
-    crowding = 1.0 if world.gripper.lopsided else _crowding(yaw, world.gripper.most, neighbours)
-    narrower = max(0.0, room - NARROW) * crowding
-    across, along, ahead = (a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist())
-    offset = across, along - world.gripper.middle(width), ahead
+    funnel = slope * max(0.0, off - min(radius, TIGHT * room))
     return Grasp(
         offset=offset,
         width=width,
@@ -192,7 +192,7 @@ def grasp_of(world: World, name: str) -> Grasp:
         yaw=yaw,
         angle=angle,
         at=(at_x, at_y, max(z, world.robot.ee.lowest, z + half - DEEPEST)),
-        wide=world.gripper.most - narrower,
+        wide=gripper.most - max(0.0, room - NARROW) * crowding,
         open_enough=world.opening >= width + min(OPEN_SLACK, OPEN_SHARE * room),
         off=off,
         height=min(half + HOVER, funnel),
@@ -214,29 +214,28 @@ def _beside_jaw(x: float, y: float, yaw: float, around: bool) -> tuple[float, fl
 
 
 def _nearest(
-    lie: Lie, world: World, position: F64, widest: float, neighbours: Sequence[tuple[float, float]]
-) -> tuple[float, float, float, Way]:
+    world: World, position: F64, lie: Lie, neighbours: Sequence[tuple[float, float]]
+) -> Candidate:
     """The grasp whose yaw is nearest to the hand's, with a small preference for zero yaw and narrow
     grasps.
 
     It depends on the hand so that a learner does not stop between two grasps, where it averages
-    their labels: any turn makes one of them the nearer. position: the object's (3,) [m]. widest:
-    width that the fingers go around [m]. neighbours: offsets (x, y) [m] of what stands around the
-    object; grasps that they obstruct come last.
+    their labels: any turn makes one of them the nearer. position: the object's (3,) [m].
+    neighbours: offsets (x, y) [m] of what stands around the object; grasps that they obstruct come
+    last.
     """
-    grasps = lie.grasps[lie.level]
-    at = world.hand_yaw
-    ahead = world.ahead(position)
+    grasps, at = lie.grasps[lie.level], world.hand_yaw
+    ahead, widest = world.ahead(position), world.gripper.most - LEAST_ROOM
     if world.robot.faces_ahead:
         at = world.turned(position)
         grasps = [
-            (way, width, length, centre)
+            (turn, width, length, centre)
             for yaw, width, length, centre in grasps
-            for way in (world.turns(yaw, math.pi, position) if lie.folds else (0.0,))
+            for turn in (world.turns(yaw, math.pi, position) if lie.folds else (0.0,))
         ]
     narrowest = min([width for _, width, _, _ in grasps])
 
-    def cost(grasp: tuple[float, float, float, Way]) -> tuple[bool, float, float]:
+    def cost(grasp: Candidate) -> tuple[bool, float, float]:
         yaw, width, _, _ = grasp
         turn = abs(yaw - at) + PREFER_ZERO * abs(yaw) + WIDTH_AS_ANGLE * (width - narrowest)
         too_wide = width > widest and width > narrowest
@@ -259,19 +258,10 @@ def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float
     return worst
 
 
-def _lie(kind: int, rotation: F64, extents: Sequence[float]) -> Lie:
-    if kind == _BOX:
-        return _box_lie(rotation, extents)
-    width, _, length = extents
-    if kind == _SPHERE:
-        return Lie(((0.0, width, width, _MIDDLE),), width, 0.0, 0)
-    ahead, left, up = rotation[:, 2].tolist()
-    if abs(up) > math.sqrt(0.5):
-        return Lie(((0.0, width, width, _MIDDLE),), length, math.acos(min(1.0, abs(up))), 0)
-    yaw = math.atan2(left, ahead)
+def _half_turns(yaw: float, size: tuple[float, float], centre: Sequence[float]) -> list[Candidate]:
+    """A grasp at the yaw nearest to 0, and half a turn to either side of it."""
     yaw -= math.pi * round(yaw / math.pi)
-    grasps = tuple((yaw + turn, width, length, _MIDDLE) for turn in _HALF_TURNS)
-    return Lie(grasps, width, math.asin(abs(up)), 2)
+    return [(yaw + turn, *size, centre) for turn in (0.0, -math.pi, math.pi)]
 
 
 def _hull_lie(hull: Hull, rotation: F64) -> Lie:
@@ -279,20 +269,13 @@ def _hull_lie(hull: Hull, rotation: F64) -> Lie:
     cosines = hull.downs.dot(-rotation[2])
     nearest = int(cosines.argmax())
     rest, tilt = hull.rest(nearest), math.acos(min(1.0, float(cosines[nearest])))
-    centres = [(x, y, z) for x, y, z in rest.centre.dot(rotation.T).tolist()]
-    if rest.round:
-        grasps = tuple(
-            (0.0, *size, centre) for size, centre in zip(rest.sizes, centres, strict=True)
-        )
-        return Lie(grasps, rest.tall, tilt, 0, above=rest.above, fits=rest.fits)
-    grasps = []
-    for (ahead, left, _), size, centre in zip(
-        rest.across.dot(rotation.T).tolist(), rest.sizes, centres, strict=True
-    ):
+    grasps: list[Candidate] = []
+    acrosses, centres = rest.across.dot(rotation.T).tolist(), rest.centre.dot(rotation.T).tolist()
+    for (ahead, left, _), size, centre in zip(acrosses, rest.sizes, centres, strict=True):
         yaw = math.atan2(left, ahead) + _QUARTER
-        yaw -= math.pi * round(yaw / math.pi)
-        grasps += [(yaw + turn, *size, centre) for turn in _HALF_TURNS]
-    return Lie(tuple(grasps), rest.tall, tilt, 2, above=rest.above, fits=rest.fits)
+        grasps += [(0.0, *size, centre)] if rest.round else _half_turns(yaw, size, centre)
+    folds = 0 if rest.round else 2
+    return Lie(grasps, rest.tall, tilt, folds, above=rest.above, fits=rest.fits)
 
 
 def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
@@ -328,14 +311,6 @@ def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
 def share(number: float) -> float:
     """Return a number clipped to 0 to 1."""
     return min(1.0, max(0.0, number))
-
-
-def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
-    """Return the angle of a hand (3, 3) from pointing down [rad], less what it may lean (`lean`:
-    0 to 1).
-    """
-    free = min(angle_off_vertical(hand), lean * LEAN)
-    return math.sqrt(max(0.0, angle * angle - free * free))
 
 
 def is_inside(offset: Sequence[float] | F64, box: tuple[float, float, float]) -> bool:

@@ -13,29 +13,27 @@ from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of, once_per_state
 from manip_il.tasks.ladder import CLOSED, nearness
-from manip_il.tasks.objects import GREY, RED, add_furniture, add_object, add_part
+from manip_il.tasks.objects import GREY, RED, add_furniture, add_object, add_part, observe_hand
 from manip_il.tasks.peg import (
     HOLE,
+    LENGTH,
     LIFT,
     LIFT_SLOPE,
     PEG,
     PEG_RUNGS,
-    Way,
+    SIDE,
+    Motion,
     hangs,
     holds_peg,
     lower_end,
+    motion_to,
     move,
     peg_progress,
     upper_axis,
-    way_to,
 )
-from manip_il.tasks.reach import observe_hand
-from manip_il.tasks.starts import draw_resting_place, draw_until, draw_yaw, product, turn_left
+from manip_il.tasks.starts import draw_resting, draw_until, draw_yaw, product, turn_left
 
-# peg [m], [m], [kg]
-SIDE = 0.058
-LENGTH = 0.10
-MASS = 0.15
+MASS = 0.15  # of the peg [kg]
 DEPTH, WALL = 0.03, 0.018  # depth of the hole, and thickness of the walls around it [m]
 # chamfer of the walls' inner edges, as high as wide [m], and its friction
 CHAMFER, SLIPPERY = 0.005, 0.05
@@ -59,19 +57,22 @@ def is_inserted(world: World) -> bool:
 
 
 @once_per_state
-def to_hole(world: World) -> Way:
+def to_hole(world: World) -> Motion:
     """Return the remaining motion of a hanging peg into the hole.
 
     Of the four rotations that fit, it takes the easiest.
     """
-    peg = world.pose(PEG)
-    hole = world.pose(HOLE)
+    peg, hole = world.pose(PEG).rotation, world.pose(HOLE)
     hand = world.ee.rotation
-    in_hand = peg.rotation.T @ hand
-    flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
-    turns = (hole.rotation @ _quarter(k, flip) @ in_hand for k in range(4))
+    flip = 1.0 if upper_axis(world) @ peg[:, 2] > 0 else -1.0
+    quarters = (
+        np.array([[c, -s * flip, 0.0], [s, c * flip, 0.0], [0.0, 0.0, flip]])
+        for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))
+    )
+    in_hand = peg.T @ hand
+    turns = (hole.rotation @ quarter @ in_hand for quarter in quarters)
     best = min(turns, key=lambda turn: angle_between(hand, turn) + _strain(turn))
-    return way_to(world, best, lambda world, end: hole.position)
+    return motion_to(world, best, lambda world, end: hole.position)
 
 
 def _strain(hand: F64) -> float:
@@ -83,14 +84,8 @@ def _strain(hand: F64) -> float:
     return (1 - tilted) * yaw + tilted * STRAIN * max(0.0, least - yaw, yaw - most)
 
 
-def _quarter(k: int, flip: float) -> F64:
-    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[k]
-    return np.array([[c, -s * flip, 0.0], [s, c * flip, 0.0], [0.0, 0.0, flip]])
-
-
 def _is_entered(world: World) -> bool:
-    way = to_hole(world)
-    return way.low < DEPTH - 0.002 and math.hypot(*way.off) < 0.006
+    return to_hole(world).low < DEPTH - 0.002 and to_hole(world).distance < 0.006
 
 
 def _lift(world: World) -> float:
@@ -103,20 +98,12 @@ def _lift(world: World) -> float:
 
 def _bring(world: World) -> Target:
     """Lift the peg over the hole, lower it on the way, and slowly insert it."""
-    way = to_hole(world)
-    missing = _lift(world) - way.low
-    if abs(way.low - DEPTH) < AT_RIM:
+    motion = to_hole(world)
+    missing = _lift(world) - motion.low
+    if abs(motion.low - DEPTH) < AT_RIM:
         missing = max(missing, -GENTLE)
-    far = math.hypot(*way.off) > 0.01
-    return move(
-        world, way, missing, sideways_at=0.015 if far else math.inf, exact=way.error < EXACT
-    )
-
-
-def _insert_or_stay(world: World) -> Target:
-    if holds_peg(world):
-        return _bring(world)
-    return Target(*world.ee, CLOSED)
+    sideways_at = 0.015 if motion.distance > 0.01 else math.inf
+    return move(world, motion, missing, sideways_at, exact=motion.error < EXACT)
 
 
 @dataclass(frozen=True)
@@ -135,7 +122,11 @@ class Insert(Task):
     objects = (PEG,)
     grasped = (PEG,)
     rungs = (
-        Rung("inserted", is_inserted, _insert_or_stay),
+        Rung(
+            "inserted",
+            is_inserted,
+            lambda w: _bring(w) if holds_peg(w) else Target(*w.ee, CLOSED),
+        ),
         Rung("insert", lambda w: hangs(w) and _lift(w) < DEPTH, _bring),
         Rung("carry", hangs, _bring),
         *PEG_RUNGS,
@@ -158,7 +149,7 @@ class Insert(Task):
         side, _, length = world.extents(PEG)
 
         def draw_hole() -> F64:
-            return draw_resting_place(rng, world, HOLE, 2 * DEPTH) * [1, 1, 0]
+            return draw_resting(rng, world, HOLE, height=2 * DEPTH) * [1, 1, 0]
 
         hole = draw_until(draw_hole, lambda at: at[0] > centre[0] - NOT_NEARER, world, HOLE)
         lies = rng.uniform() < 0.5
@@ -167,12 +158,10 @@ class Insert(Task):
         def fits(at: F64) -> bool:
             return math.dist(at[:2], hole[:2]) > APART and at[0] < farthest
 
-        peg = draw_until(lambda: draw_resting_place(rng, world, PEG, height / 2), fits, world, PEG)
+        peg = draw_until(lambda: draw_resting(rng, world, PEG, height=height / 2), fits, world, PEG)
         turn = draw_yaw(rng, np.pi)
         if lies:
-            turn = product(
-                turn, np.array([math.cos(_QUARTER / 2), 0.0, math.sin(_QUARTER / 2), 0.0])
-            )
+            turn = product(turn, _turn_ahead(_QUARTER))
         return Start({PEG: (peg, turn), HOLE: (hole, draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
@@ -206,12 +195,17 @@ class Insert(Task):
             return 1.0
         if not hangs(world):
             return 0.6 * peg_progress(world)
-        way = to_hole(world)
+        motion = to_hole(world)
         if _is_entered(world):
-            return 0.9 + 0.1 * max(0.0, 1.0 - way.low / DEPTH)
+            return 0.9 + 0.1 * max(0.0, 1.0 - motion.low / DEPTH)
         height = max(0.0, _lift(world) - DEPTH)
-        rest = math.hypot(*way.off) + abs(DEPTH + height - way.low) + height + 0.1 * way.angle
+        rest = motion.distance + abs(DEPTH + height - motion.low) + height + 0.1 * motion.angle
         return 0.6 + 0.3 * nearness(rest)
+
+
+def _turn_ahead(angle: float) -> F64:
+    """The quaternion, wxyz (4,), of a turn about y, from z towards x [rad]."""
+    return np.array([math.cos(angle / 2), 0.0, math.sin(angle / 2), 0.0])
 
 
 def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
@@ -223,22 +217,11 @@ def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
     c, s = math.cos(yaw), math.sin(yaw)
     out, thick = inner + WALL / 2, CHAMFER / 2
     half = (WALL / 2, inner + WALL, height / 2)
-    add_part(hole, name, half, (c * out, s * out, height / 2), GREY)
-    hole.geoms[-1].quat = turn_left(yaw)
-    out, up = (
-        inner + CHAMFER / 2 + thick * math.sin(steep),
-        height + CHAMFER / 2 - thick * math.cos(steep),
-    )
-    add_part(
-        hole,
-        f"{name} edge",
-        (CHAMFER / math.sqrt(2), inner + WALL, thick),
-        (c * out, s * out, up),
-        GREY,
-    )
-    edge = hole.geoms[-1]
-    edge.quat = product(
-        turn_left(yaw), np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0])
-    )
+    add_part(hole, name, half, (c * out, s * out, height / 2), GREY).quat = turn_left(yaw)
+    out = inner + CHAMFER / 2 + thick * math.sin(steep)
+    up = height + CHAMFER / 2 - thick * math.cos(steep)
+    half = (CHAMFER / math.sqrt(2), inner + WALL, thick)
+    edge = add_part(hole, f"{name} edge", half, (c * out, s * out, up), GREY)
+    edge.quat = product(turn_left(yaw), _turn_ahead(-steep))
     edge.friction = [SLIPPERY, 0.005, 0.0001]
     edge.priority = 1

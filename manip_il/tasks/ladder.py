@@ -37,7 +37,6 @@ FREED = 0.4  # share of that extra opening at which the object is free
 AT_GOAL = 0.01  # [m]
 CLOSED = 0.0  # commanded opening of a hand that grips [m]
 _HALFWAY = 0.2  # distance left at which half of a part's progress is made [m]
-_GRASPED = 0.5  # progress of an object that is held
 
 
 class LiftProfile(NamedTuple):
@@ -75,12 +74,12 @@ def is_held(world: World, name: str) -> bool:
         return False  # too far away; grasps need not be computed
     if world.hull(name) is None:
         g = grasp_of(world, name)
-        is_between = is_inside(g.offset, (g.length / 2 + x, y, g.half + z))
+        offset, box = g.offset, (g.length / 2 + x, y, g.half + z)
     else:  # a mesh may be at any rotation in the hand
-        across, along, ahead = (world.at(name) - world.ee.position).dot(world.ee.rotation).tolist()
-        along -= world.gripper.middle(world.opening)
-        is_between = is_inside((across, along, ahead), (half + x, y, half + z))
-    return is_between and world.touched(name)
+        offset = (world.at(name) - world.ee.position).dot(world.ee.rotation).tolist()
+        offset[1] -= world.gripper.middle(world.opening)
+        box = (half + x, y, half + z)
+    return is_inside(offset, box) and world.touched(name)
 
 
 def at_grasp(world: World, name: str) -> bool:
@@ -93,8 +92,8 @@ def at_grasp(world: World, name: str) -> bool:
     if world.hull(name) is not None:
         # A mesh's sides may be round: fingers that close too high slip off.
         deep = max(LEAST_DEEP, DEEP_SHARE * lie_of(world, name).tall)
-        over = float(world.ee.position[2]) - g.at[2]
-        if world.opening < EMPTY * g.width or over > (deep if g.open_enough else 2 * deep):
+        deep = deep if g.open_enough else 2 * deep
+        if world.opening < EMPTY * g.width or world.ee.position[2] - g.at[2] > deep:
             return False
     return is_inside(g.offset, box) and g.angle < AT_GRASP_ANGLE and g.settled
 
@@ -133,12 +132,12 @@ def approach(world: World, name: str, hover: float = 0.0, rise: float = 0.0) -> 
 def close_on(world: World, name: str) -> Target:
     """Close the fingers on the object, where it is."""
     g = grasp_of(world, name)
-    at = np.array(g.at)
+    at, hand = np.array(g.at), hand_down(g.yaw)
     # the moving jaw pushes the object to the fixed one; the hand does not follow
     if world.gripper.lopsided:
-        across = np.array([math.sin(g.yaw), -math.cos(g.yaw), 0.0])
-        at += across * float(across @ (world.ee.position - at))
-    return Target(at, hand_down(g.yaw), CLOSED, lean=g.lean)
+        across = hand[:, 1].copy()
+        at += across * (across @ (world.ee.position - at))
+    return Target(at, hand, CLOSED, lean=g.lean)
 
 
 def carry(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) -> Target:
@@ -170,8 +169,9 @@ def let_go(world: World, name: str, height: float) -> Target:
     g, ee = grasp_of(world, name), world.ee
     beyond = min(RELEASE, world.gripper.most - g.width)
     free = world.opening > g.width + FREED * beyond and not world.touched(name)
-    up = world.at(name)[2] + height if free else ee.position[2]
-    at = np.array([*ee.position[:2], up])
+    at = ee.position.copy()
+    if free:
+        at[2] = world.at(name)[2] + height
     if world.gripper.lopsided:  # the fixed jaw must move off the object, too
         along = g.offset[1] + world.gripper.middle(g.width) - world.gripper.middle(g.width + beyond)
         at[:2] += along * ee.rotation[:2, 1]
@@ -208,7 +208,7 @@ def grasp_rungs(
 
     def near(world: World) -> bool:
         g = grasp_of(world, which(world))
-        return (g.height if g.settled else max(g.height, g.half + CLEAR)) < g.half + HOVER
+        return g.height < g.half + HOVER
 
     def approaching(world: World) -> Target:
         return approach(world, which(world), hover)
@@ -225,10 +225,7 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
     """Return the ladder that grasps an object and carries it to the goal."""
 
     def at_goal(world: World) -> bool:
-        return (
-            is_held(world, name)
-            and math.dist(world.at(name).tolist(), world.goal.tolist()) < AT_GOAL
-        )
+        return is_held(world, name) and math.dist(world.at(name), world.goal) < AT_GOAL
 
     def to_goal(world: World) -> Target:
         return carry(world, name, world.goal)
@@ -252,7 +249,7 @@ def grasp_progress(world: World, name: str, hover: float = 0.0, rise: float = 0.
         rise: The least height over the grasp [m].
     """
     g = grasp_of(world, name)
-    above = float(world.ee.position[2]) - g.at[2]
+    above = world.ee.position[2] - g.at[2]
     height = max(g.height, min(hover, g.funnel), rise)
     return nearness(g.off + abs(above - height) + height)
 
@@ -263,8 +260,8 @@ def pick_progress(world: World, name: str) -> float:
     It depends on the distance left on that path.
     """
     if is_held(world, name):
-        return _GRASPED + (1 - _GRASPED) * carry_progress(world, name, world.goal)
-    return 0.9 * _GRASPED * grasp_progress(world, name)
+        return 0.5 + 0.5 * carry_progress(world, name, world.goal)
+    return 0.45 * grasp_progress(world, name)
 
 
 def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = OVER_NOTHING) -> float:
@@ -278,7 +275,7 @@ def carry_progress(world: World, name: str, to: F64, lift: LiftProfile = OVER_NO
         to: The target of the object's centre, (3,) [m].
         lift: The height of the object on its way there.
     """
-    x, y, z = (to - world.at(name)).tolist()
+    x, y, z = to - world.at(name)
     off = math.hypot(x, y)
     height = lift.over(off)
     return nearness(abs(z + height) + off + height)

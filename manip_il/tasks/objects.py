@@ -1,16 +1,23 @@
-"""Free objects, furniture and goal markers that tasks put on the table."""
+"""Free objects, furniture and goal markers that tasks put on the table, and what is observed of
+objects and hand.
+"""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from manip_il.mdp import F64
 from manip_il.sim.mesh import Mesh
 from manip_il.sim.shape import ANY, MESH, contact
+from manip_il.sim.task import Observed
 from manip_il.sim.variation import GEOMS
-from manip_il.sim.world import GOAL
+from manip_il.sim.world import GOAL, World
+from manip_il.tasks.grasp import is_cube, lie_of
 
+Colour = tuple[float, ...]  # red, green and blue, 0 to 1
 CUBE_HALF = 0.025  # [m]
 CUBE_MASS = 0.1  # [kg]
 MOST_HULL = 500  # vertices of a mesh's collision hull: finer ones take seconds to compile
@@ -29,7 +36,7 @@ def add_cube(
     name: str,
     half: float = CUBE_HALF,
     mass: float = CUBE_MASS,
-    colour: tuple[float, ...] = RED,
+    colour: Colour = RED,
 ) -> None:
     """Add a free cube.
 
@@ -49,7 +56,7 @@ def add_object(
     shape: str,
     size: Sequence[float],
     mass: float,
-    colour: tuple[float, ...],
+    colour: Colour,
     mesh: Mesh | None = None,
 ) -> None:
     """Add a free object.
@@ -67,19 +74,22 @@ def add_object(
     body = spec.worldbody.add_body(name=name, pos=[0.5, 0, max(size)])
     body.add_freejoint(name=name)
     condim, rolling = contact(shape)
-    touching: Any = {
-        "condim": condim,
-        "friction": [FRICTION, 0.02, rolling],
-        "solimp": [0.95, 0.99, 0.001, 0.5, 2],
-        "solref": [0.01, 1],
-    }
-    seen: Any = {"name": name, "type": SHAPES[shape], "mass": mass, "material": material.name}
+    geom = body.add_geom(
+        name=name,
+        type=SHAPES[shape],
+        mass=mass,
+        material=material.name,
+        condim=condim,
+        friction=[FRICTION, 0.02, rolling],
+        solimp=[0.95, 0.99, 0.001, 0.5, 2],
+        solref=[0.01, 1],
+    )
     if mesh is None:
-        body.add_geom(**seen, size=[*size, *[0.0] * (3 - len(size))], **touching)
+        geom.size[: len(size)] = size
         return
     drawn = spec.add_mesh(name=name, uservert=mesh.vertices.ravel(), maxhullvert=MOST_HULL)
     drawn.userface, drawn.inertia = mesh.faces.ravel(), mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT
-    body.add_geom(**seen, meshname=name, **touching)
+    geom.meshname = name
 
 
 def add_furniture(spec: mujoco.MjSpec, name: str) -> Any:
@@ -88,9 +98,13 @@ def add_furniture(spec: mujoco.MjSpec, name: str) -> Any:
 
 
 def add_part(
-    body: Any, name: str, half: Sequence[float], at: Sequence[float], colour: tuple[float, ...]
-) -> None:
-    """Add a solid box to a body.
+    body: Any,
+    name: str,
+    half: Sequence[float],
+    at: Sequence[float],
+    colour: Colour = WOOD,
+) -> Any:
+    """Add a solid box to a body and return its geom.
 
     Args:
         body: The body to add it to.
@@ -99,7 +113,7 @@ def add_part(
         at: Its middle in the body's frame, (3,) [m].
         colour: Red, green and blue, 0 to 1.
     """
-    body.add_geom(
+    return body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=list(half),
@@ -108,6 +122,27 @@ def add_part(
         friction=[0.6, 0.005, 0.0001],
         mass=1000 * 8 * float(np.prod(half)),
     )
+
+
+def add_sides(
+    body: Any,
+    name: str,
+    half: Sequence[float],
+    at: Sequence[float],
+    colour: Colour = WOOD,
+) -> None:
+    """Add two solid boxes, `NAME left` and `NAME right`, which mirrors it in y.
+
+    Args:
+        body: The body to add them to.
+        name: The name of their geoms, before the side.
+        half: Half the lengths of each, (3,) [m].
+        at: The middle of the left one in the body's frame, (3,) [m].
+        colour: Red, green and blue, 0 to 1.
+    """
+    x, y, z = at
+    add_part(body, f"{name} left", half, at, colour)
+    add_part(body, f"{name} right", half, (x, -y, z), colour)
 
 
 def add_goal(spec: mujoco.MjSpec, *, flat: bool = False) -> None:
@@ -126,3 +161,45 @@ def add_goal(spec: mujoco.MjSpec, *, flat: bool = False) -> None:
     body.add_geom(
         name=GOAL, type=shape, size=size, material=material.name, contype=0, conaffinity=0, mass=0
     )
+
+
+def observe_hand(world: World) -> Observed:
+    """Return the hand's position and its y and z axes.
+
+    They are the first entries of every `environment_state`.
+    """
+    ee = world.ee
+    return {"ee": ee.position, "ee.axis_y": ee.rotation[:, 1], "ee.axis_z": ee.rotation[:, 2]}
+
+
+def observe_object(world: World, name: str, known_as: str = "") -> Observed:
+    """Return an object's pose and lengths, and the vector to it from the hand.
+
+    The pose is its position, its yaw modulo its symmetry, and its tilt.
+
+    Args:
+        world: The world to look at.
+        name: The object's name.
+        known_as: The name of the object in what is returned, by default its own.
+    """
+    known_as = known_as or name
+    position, lie = world.at(name), lie_of(world, name)
+    only_cubes = not world.scene.draws_shape and is_cube(world, name)
+    folds = "4" if only_cubes else ""
+    # numbers of the narrowest grasp change continuously as the object turns
+    yaw, width, length, centre = min(lie.grasps, key=lambda grasp: grasp[1])
+    seen: dict[str, F64 | float] = {
+        f"cos{folds}yaw": math.cos(lie.folds * yaw),
+        f"sin{folds}yaw": math.sin(lie.folds * yaw),
+        "tilt": lie.tilt,
+        "width": width,
+    }
+    if not only_cubes:
+        seen = {"folds": float(lie.folds), **seen, "length": length, "height": lie.tall}
+    if world.hull(name) is not None:
+        seen["grasp"] = np.array(centre)
+    return {
+        known_as: position,
+        **{f"{known_as}.{key}": value for key, value in seen.items()},
+        f"{known_as}_from_ee": position - world.ee.position,
+    }

@@ -19,12 +19,14 @@ from manip_il.robots.geometry import (
     turn_about_z,
 )
 from manip_il.robots.reach import ARRIVES, reach_of
+from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.task import Rung, Target
-from manip_il.sim.world import SCENES_KEPT, Scene, World
+from manip_il.sim.world import Scene, World
 from manip_il.tasks.grasp import OPEN_SLACK, is_inside, lie_of, once_per_state, share
 from manip_il.tasks.ladder import CLOSED, LiftProfile, nearness, rise_first
 
 PEG, HOLE = "peg", "hole"
+SIDE, LENGTH = 0.058, 0.10  # of the peg [m]
 # least opening beyond the peg, as a share of the most possible, if less than `OPEN_SLACK`
 _OPEN_SHARE = 0.85
 FROM_END = 0.04  # distance of the grip from the peg's upper end [m]
@@ -103,7 +105,7 @@ def lower_end(world: World) -> F64:
     """Return the middle of the peg's lower end, (3,) [m]."""
     peg = world.pose(PEG)
     axis = peg.rotation[:, 2]
-    return peg.position - math.copysign(world.extents(PEG)[2] / 2, axis[2]) * axis
+    return peg.position - math.copysign(LENGTH / 2, axis[2]) * axis
 
 
 @once_per_state
@@ -116,17 +118,17 @@ def upper_axis(world: World) -> F64:
     peg, ee = world.pose(PEG), world.ee
     axis = peg.rotation[:, 2]
     if stands(world):
-        return math.copysign(1.0, axis[2]) * axis
-    if holds_peg(world):
-        from_peg = ee.position - peg.position - BACK * ee.rotation[:, 2]
-        return math.copysign(1.0, float(axis @ from_peg)) * axis
-    at = angle_across(ee.rotation)
-    return min((axis, -axis), key=lambda a: _far_turn(math.atan2(a[1], a[0]), at))
+        upwards = axis[2]
+    elif holds_peg(world):
+        upwards = axis @ (ee.position - peg.position - BACK * ee.rotation[:, 2])
+    else:
+        return min((axis, -axis), key=lambda a: _far_turn(world, math.atan2(a[1], a[0])))
+    return math.copysign(1.0, upwards) * axis
 
 
-def _far_turn(yaw: float, at: float) -> float:
+def _far_turn(world: World, yaw: float) -> float:
     """Cost of a yaw, by its distance from the hand's and from straight ahead [rad]."""
-    return abs(yaw - at) + 0.5 * abs(yaw)
+    return abs(yaw - angle_across(world.ee.rotation)) + 0.5 * abs(yaw)
 
 
 def stands(world: World) -> bool:
@@ -140,12 +142,9 @@ def holds_peg(world: World) -> bool:
 
     Both fingers touch the peg, and the hand is within the peg's faces and ends or just outside.
     """
-    if not world.touched(PEG):
-        return False
     peg = world.pose(PEG)
-    x, y, z = np.abs(peg.rotation.T @ (world.ee.position - peg.position)).tolist()
-    side, _, length = world.extents(PEG)
-    return max(x, y) < side / 2 + BARE and z < length / 2 + BARE
+    x, y, z = np.abs(peg.rotation.T @ (world.ee.position - peg.position))
+    return max(x, y) < SIDE / 2 + BARE and z < LENGTH / 2 + BARE and world.touched(PEG)
 
 
 def is_aslant(world: World) -> bool:
@@ -156,25 +155,21 @@ def is_aslant(world: World) -> bool:
 @once_per_state
 def grip_of(world: World) -> Grip:
     """Return the grip that the hand aims for, given how the peg stands or lies."""
-    ee, peg = world.ee, world.pose(PEG)
-    width, _, length = world.extents(PEG)
-    axis = upper_axis(world)
-    position = peg.position + (length / 2 - FROM_END) * axis
+    ee, axis = world.ee, upper_axis(world)
+    position = world.at(PEG) + (LENGTH / 2 - FROM_END) * axis
+    yaw, pitch = math.atan2(axis[1], axis[0]), 0.0
     if stands(world):
-        at = angle_across(ee.rotation)
-        yaw = min(
-            (grasp[0] for grasp in lie_of(world, PEG).grasps), key=lambda yaw: _far_turn(yaw, at)
-        )
-        rotation = hand_at(yaw, 0.0)
+        yaws = [yaw for yaw, _, _, _ in lie_of(world, PEG).grasps]
+        yaw = min(yaws, key=lambda yaw: _far_turn(world, yaw))
     else:
         room = _farthest(world.scene) - position[0]
-        lean = min(LEAN, LEAN_BY_ROOM * max(0.0, room))
-        rotation = hand_at(math.atan2(axis[1], axis[0]), -lean)
+        pitch = -min(LEAN, LEAN_BY_ROOM * max(0.0, room))
+    rotation = hand_at(yaw, pitch)
     position[2] = max(position[2], LOWEST)
     angle = angle_between(ee.rotation, rotation)
     off = math.hypot(*(position - ee.position)[:2]) + 0.05 * max(0.0, angle - 0.1)
-    slack = min(OPEN_SLACK, _OPEN_SHARE * (world.gripper.most - width))
-    return Grip(position, rotation, off, angle, FUNNEL.over(off), world.opening >= width + slack)
+    slack = min(OPEN_SLACK, _OPEN_SHARE * (world.gripper.most - SIDE))
+    return Grip(position, rotation, off, angle, FUNNEL.over(off), world.opening >= SIDE + slack)
 
 
 @lru_cache(SCENES_KEPT)
@@ -186,32 +181,31 @@ def _farthest(scene: Scene) -> float:
     return x
 
 
-class Way(NamedTuple):
+class Motion(NamedTuple):
     """Remaining motion of a held peg.
 
     Attributes:
         rotation: The hand's rotation once the peg is upright and, if it goes into the hole, aligned
             with the hole, (3, 3).
         turn: The remaining rotation vector of the hand, (3,) [rad].
+        angle: The length of `turn` [rad].
         off: The remaining horizontal offset, (2,) [m].
-        error: `off` and `turn` as one length [m].
+        distance: The length of `off` [m].
+        error: `distance` and `angle` as one length [m].
         low: The height of the peg's lower end over the table once the peg is upright [m].
     """
 
     rotation: F64
     turn: F64
+    angle: float
     off: F64
+    distance: float
     error: float
     low: float
 
-    @property
-    def angle(self) -> float:
-        """Angle through which the hand must still turn [rad]."""
-        return math.hypot(*self.turn)
-
 
 @once_per_state
-def to_stand(world: World) -> Way:
+def to_stand(world: World) -> Motion:
     """Return the remaining motion of a held peg that must stand on the table first.
 
     The peg turns upright by the smallest rotation, and the hand turns to one side. The peg's place
@@ -219,18 +213,18 @@ def to_stand(world: World) -> Way:
     """
     hand, axis = world.ee.rotation, upper_axis(world)
     upright = _upright(axis) @ hand
-    y, at = float(world.ee.position[1]) - world.robot.workspace.centre[1], angle_across(hand)
+    y, at = world.ee.position[1] - world.robot.workspace.centre[1], angle_across(hand)
     least, most = ASIDE
     yaw = min(
         (math.copysign(min(most, max(least, side * at)), side) for side in (1.0, -1.0)),
         key=lambda yaw: abs(yaw - at) + 8.0 * max(0.0, math.copysign(y, yaw * y)),
     )
-    return way_to(world, turn_about_z(yaw - angle_across(upright)) @ upright, _free_place)
+    return motion_to(world, turn_about_z(yaw - angle_across(upright)) @ upright, _free_place)
 
 
 def _upright(axis: F64) -> F64:
     """The smallest rotation that turns an axis up, (3, 3)."""
-    x, y, z = axis.tolist()
+    x, y, z = axis
     if z < -0.99:
         return np.diag([1.0, -1.0, -1.0])
     k = 1 / (1 + z)
@@ -241,14 +235,14 @@ def _free_place(world: World, end: F64) -> F64:
     """Place (3,) [m] on the table to set the peg up, nearest to where its lower end (3,) would
     be.
     """
-    x, y, _ = end.tolist()
     middle = world.robot.workspace.centre[0]
-    at = np.array([min(middle + NEAR_MIDDLE, max(middle - NEAR_MIDDLE, x)), y, 0.0])
+    x = min(middle + NEAR_MIDDLE, max(middle - NEAR_MIDDLE, end[0]))
+    at = np.array([x, end[1], 0.0])
     from_hole = at - world.at(HOLE)
     return at + max(0.0, FROM_HOLE / max(math.hypot(*from_hole[:2]), 1e-6) - 1) * from_hole
 
 
-def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
+def motion_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Motion:
     """Return the motion that is left if the hand turns with the peg to a rotation.
 
     Args:
@@ -259,89 +253,86 @@ def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
     """
     ee, peg = world.ee, world.pose(PEG)
     turn = rotation_vector(rotation @ ee.rotation.T)
-    end = peg.position - world.extents(PEG)[2] / 2 * upper_axis(world)
+    end = peg.position - LENGTH / 2 * upper_axis(world)
     # the lower end, once the peg is upright
     turned = ee.position + rotation @ (ee.rotation.T @ (end - ee.position))
     off = (to(world, turned) - turned)[:2]
-    error = math.hypot(*off) + ANGLE_AS_LENGTH * math.hypot(*turn)
-    return Way(rotation, turn, off, error, float(turned[2]))
+    angle, distance = math.hypot(*turn), math.hypot(*off)
+    error = distance + ANGLE_AS_LENGTH * angle
+    return Motion(rotation, turn, angle, off, distance, error, turned[2])
 
 
 def _set_up(world: World) -> Target:
     """Lift the peg and turn it upright over a free place, then lower it to the table."""
-    way = to_stand(world)
-    return move(world, way, _set_up_height(world, way) - way.low, sideways_at=0.03)
+    motion = to_stand(world)
+    return move(world, motion, _set_up_height(world) - motion.low, sideways_at=0.03)
 
 
-def _set_up_height(world: World, way: Way) -> float:
+def _set_up_height(world: World) -> float:
     """Target height of the lower end over the table, greater near the walls of the hole [m]."""
     room = math.dist(world.at(PEG)[:2], world.at(HOLE)[:2]) - FROM_HOLE
     most = LIFT + OVER_WALLS * share(1 - room / OVER_WALLS)
     # without the hand's yaw, which may be out of reach
-    tilt = math.acos(min(1.0, float(upper_axis(world)[2])))
-    error = math.hypot(*way.off) + ANGLE_AS_LENGTH * tilt
+    tilt = math.acos(min(1.0, upper_axis(world)[2]))
+    error = to_stand(world).distance + ANGLE_AS_LENGTH * tilt
     return min(most, LIFT_SLOPE * max(0.0, error - SET_DOWN)) - 0.001
 
 
-def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool = False) -> Target:
+def move(
+    world: World, motion: Motion, missing: float, sideways_at: float, exact: bool = False
+) -> Target:
     """Return the target that moves the held peg with the hand.
 
     Args:
         world: The world to look at.
-        way: The motion that is left.
+        motion: The motion that is left.
         missing: The height that the peg's lower end must still gain, negative if it must sink [m].
         sideways_at: The missing height below which the peg also moves sideways [m].
         exact: Whether the hand must be placed exactly, see `Target`.
     """
     sideways = share(1.0 - missing / sideways_at)
     turn = TURN * min(1.0, max(0.25, 1.0 - missing / 0.06))
-    rotation = way.rotation
+    rotation = motion.rotation
     if exact:
-        sideways, rotation = (
-            FARTHER * sideways,
-            rotation_matrix((FARTHER - 1) * way.turn) @ rotation,
-        )
-    position = world.ee.position + np.array([*(sideways * way.off), max(missing, -SLOW)])
-    step = min(FAST, SLOW + max(0.0, way.error - 0.02))
+        sideways *= FARTHER
+        rotation = rotation_matrix((FARTHER - 1) * motion.turn) @ rotation
+    position = world.ee.position + np.append(sideways * motion.off, max(missing, -SLOW))
+    step = min(FAST, SLOW + max(0.0, motion.error - 0.02))
     return Target(position, rotation, CLOSED, max_step=step, max_turn=turn, exact=exact)
 
 
 def is_up(world: World) -> bool:
     """Return whether the peg stands on the table, with an oblique hand at it or just above it."""
-    x, y, z = (world.ee.position - lower_end(world)).tolist()
-    up = float(upper_axis(world)[2]) > math.cos(0.15) and lower_end(world)[2] < ON_TABLE
-    return up and is_aslant(world) and math.hypot(x, y) < 0.03 and z < world.extents(PEG)[2] + CLEAR
+    end = lower_end(world)
+    x, y, z = world.ee.position - end
+    up = upper_axis(world)[2] > math.cos(0.15) and end[2] < ON_TABLE
+    return up and is_aslant(world) and math.hypot(x, y) < 0.03 and z < LENGTH + CLEAR
 
 
 def _let_stand(world: World) -> Target:
     """Open the fingers, then rise straight up."""
-    ee, width = world.ee, world.extents(PEG)[0]
-    free = world.opening > width + LET_GO and not world.touched(PEG)
+    free = world.opening > SIDE + LET_GO and not world.touched(PEG)
     up = [0.0, 0.0, 0.1 if free else 0.0]
-    opening = min(width + RELEASE, world.gripper.most)
-    return Target(ee.position + up, ee.rotation, opening, max_step=0.04)
+    opening = min(SIDE + RELEASE, world.gripper.most)
+    return Target(world.ee.position + up, world.ee.rotation, opening, max_step=0.04)
 
 
 def _falls(world: World) -> bool:
     """Whether the peg, between the fingers or just under their tips, neither stands nor lies."""
-    peg, ee = world.pose(PEG), world.ee
-    way = ee.position - peg.position
-    along = float(peg.rotation[:, 2] @ way)
-    beside = ee.rotation.T @ (way - along * peg.rotation[:, 2])
+    peg, lie = world.pose(PEG), lie_of(world, PEG)
+    axis, way = peg.rotation[:, 2], world.ee.position - peg.position
+    along = float(axis @ way)
+    beside = world.ee.rotation.T @ (way - along * axis)
     between = abs(beside[1]) < world.opening / 2 and math.hypot(*beside) < BESIDE
-    if not between or abs(along) > world.extents(PEG)[2] / 2:
-        return False
-    return (
-        lie_of(world, PEG).tilt > 0.06
-        or float(peg.position[2]) - lie_of(world, PEG).tall / 2 > IN_AIR
-    )
+    moves = lie.tilt > 0.06 or peg.position[2] - lie.tall / 2 > IN_AIR
+    return between and abs(along) <= LENGTH / 2 and moves
 
 
 def _catch(world: World) -> Target:
     """Close the fingers and follow the peg."""
     ee, axis = world.ee, upper_axis(world)
-    along = float(axis @ (ee.position - world.at(PEG)))
-    down = (world.extents(PEG)[2] / 2 - FROM_END - along) * axis
+    along = axis @ (ee.position - world.at(PEG))
+    down = (LENGTH / 2 - FROM_END - along) * axis
     return Target(ee.position + down, ee.rotation, CLOSED)
 
 
@@ -371,13 +362,12 @@ def peg_progress(world: World) -> float:
     A peg that lies must first be set up.
     """
     grip = grip_of(world)
-    above = float(world.ee.position[2] - grip.position[2])
+    above = world.ee.position[2] - grip.position[2]
     if is_up(world):
         return 0.55 + 0.11 * share(above / (FROM_END + CLEAR))
     if holds_peg(world):
-        way = to_stand(world)
-        height = _set_up_height(world, way)
-        rest = math.hypot(*way.off) + abs(height - way.low) + height + 0.25 * way.angle
+        motion, height = to_stand(world), _set_up_height(world)
+        rest = motion.distance + abs(height - motion.low) + height + 0.25 * motion.angle
         return 0.33 + 0.2 * nearness(rest)
     near = nearness(grip.off + abs(above - grip.height) + grip.height)
     return 0.68 + 0.31 * near if stands(world) else 0.3 * near

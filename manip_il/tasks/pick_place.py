@@ -14,21 +14,28 @@ from manip_il.mdp import F64
 from manip_il.sim.shape import CUBE, ObjectShape
 from manip_il.sim.task import CUBE_SIZES, Observed, Start, Task
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.grasp import is_cube, lie_of
+from manip_il.tasks.grasp import lie_of
 from manip_il.tasks.ladder import is_held, pick_progress, pick_rungs
-from manip_il.tasks.objects import CUBE_MASS, RED, add_goal, add_object
-from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.objects import (
+    CUBE_MASS,
+    RED,
+    add_goal,
+    add_object,
+    observe_hand,
+    observe_object,
+)
 from manip_il.tasks.starts import (
-    FEW_DRAWS,
-    LIFT,
-    LIFT_HEIGHT,
     UPRIGHT,
+    draw_few,
     draw_goal,
     draw_lying,
     draw_until,
 )
 
 OBJECT = "object"
+LIFT = (0.1, 0.25)  # height of a lift's goal above the object's start [m]
+# workspace height from which the full `LIFT` is used; lower workspaces scale it down [m]
+LIFT_HEIGHT = 0.45
 ANY_SHAPE = 200  # horizon: small or rolling objects take more attempts than a cube
 
 
@@ -89,7 +96,7 @@ class PickPlace(Task):
 
     def error(self, world: World) -> float:
         """Return the distance of the object's centre from the goal [m]."""
-        return math.dist(world.at(OBJECT).tolist(), world.goal.tolist())
+        return math.dist(world.at(OBJECT), world.goal)
 
     def unsound(self, world: World) -> str:
         """Return why there is no sound label, or "" if there is one.
@@ -122,36 +129,7 @@ class Lift(PickPlace):
 
         def draw_both() -> dict[str, tuple[F64, F64]]:
             at, turn = draw_lying(rng, world, OBJECT)
-            goals = (at + [0.0, 0.0, rng.uniform(low, high)] for _ in range(FEW_DRAWS))
-            goal = next((goal for goal in goals if world.reach.has(goal)), None)
+            goal = draw_few(lambda: at + [0.0, 0.0, rng.uniform(low, high)], world.reach.has)
             return {} if goal is None else {OBJECT: (at, turn), GOAL: (goal, UPRIGHT)}
 
         return Start(draw_until(draw_both, bool, world, "the goal"))
-
-
-def observe_object(world: World, name: str) -> Observed:
-    """Return an object's pose and lengths, and the vector to it from the hand.
-
-    The pose is its position, its yaw modulo its symmetry, and its tilt.
-    """
-    position, lie = world.at(name), lie_of(world, name)
-    if not world.scene.draws_shape and is_cube(world, name):
-        seen: Observed = {
-            f"{name}.cos4yaw": math.cos(4 * lie.yaw),
-            f"{name}.sin4yaw": math.sin(4 * lie.yaw),
-            f"{name}.tilt": lie.tilt,
-            f"{name}.width": world.extents(name)[0],
-        }
-    else:  # numbers of the narrowest grasp change continuously as the object turns
-        yaw, width, length, centre = min(lie.grasps, key=lambda grasp: grasp[1])
-        seen = {
-            f"{name}.folds": float(lie.folds),
-            f"{name}.cosyaw": math.cos(lie.folds * yaw),
-            f"{name}.sinyaw": math.sin(lie.folds * yaw),
-            f"{name}.tilt": lie.tilt,
-            f"{name}.width": width,
-            f"{name}.length": length,
-            f"{name}.height": lie.tall,
-            **({f"{name}.grasp": np.array(centre)} if world.hull(name) else {}),
-        }
-    return {name: position, **seen, f"{name}_from_ee": position - world.ee.position}

@@ -9,9 +9,8 @@ from manip_il.robots.geometry import hand_down
 from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.ladder import CLOSED, LiftProfile, nearness, rise_first
-from manip_il.tasks.objects import GREY, RED, add_furniture, add_part
-from manip_il.tasks.reach import observe_hand
-from manip_il.tasks.starts import draw_resting_place, draw_yaw
+from manip_il.tasks.objects import GREY, RED, add_furniture, add_part, observe_hand
+from manip_il.tasks.starts import draw_resting, draw_yaw
 
 BUTTON, CAP = "button", "cap"
 TRAVEL = 0.015  # travel of the cap [m]
@@ -28,12 +27,12 @@ _STIFF, _DAMPED = 150.0, 4.0  # stiffness and damping of the spring [N/m], [N s/
 
 def pressed(world: World) -> float:
     """Return how far the cap is pressed down [m]."""
-    return min(TRAVEL, max(0.0, TOP - float(world.at(CAP)[2])))
+    return min(TRAVEL, max(0.0, TOP - world.at(CAP)[2]))
 
 
 def _off(world: World) -> float:
     """Horizontal distance of the hand from the button [m]."""
-    return math.hypot(*(world.ee.position - world.at(BUTTON))[:2].tolist())
+    return math.hypot(*(world.ee.position - world.at(BUTTON))[:2])
 
 
 def _aim(world: World) -> Target:
@@ -75,7 +74,7 @@ class Press(Task):
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw where the button stands, not under the hand, and its yaw."""
-        at = draw_resting_place(rng, world, BUTTON, TOP)
+        at = draw_resting(rng, world, BUTTON, height=TOP)
         return Start({BUTTON: (np.append(at[:2], 0.0), draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
@@ -92,6 +91,6 @@ class Press(Task):
         off = _off(world)
         if pressed(world) > STOPPED and off < OVER:
             return 0.7 + 0.3 * pressed(world) / TRAVEL
-        above = max(0.0, float(world.ee.position[2]) - TOP - TIP)
+        above = max(0.0, world.ee.position[2] - TOP - TIP)
         height = FUNNEL.over(off)
         return 0.7 * nearness(off + abs(above - height) + height)

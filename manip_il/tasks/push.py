@@ -12,8 +12,7 @@ from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.grasp import share
 from manip_il.tasks.ladder import AT_GOAL, LiftProfile, nearness, rise_first
-from manip_il.tasks.objects import RED, add_goal, add_object
-from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.objects import RED, add_goal, add_object, observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_xy, resting_height
 
 PUCK = "puck"
@@ -97,17 +96,8 @@ def _to(world: World, position: F64, direction: F64, max_step: float = 0.12) -> 
 def _behind(world: World) -> tuple[float, float]:
     """Distances of the hand behind the puck on the line to the goal, and beside that line [m]."""
     direction, _ = _way(world)
-    x, y = (_hand(world) - world.at(PUCK))[:2].tolist()
+    x, y, _ = _hand(world) - world.at(PUCK)
     return -(x * direction[0] + y * direction[1]), abs(x * direction[1] - y * direction[0])
-
-
-def _at_goal(world: World) -> bool:
-    return _way(world)[1] < AT_GOAL
-
-
-def _stay(world: World) -> Target:
-    """Hold the hand where it is."""
-    return Target(*world.ee, _style(world).opening)
 
 
 def _pushes(world: World) -> bool:
@@ -142,10 +132,6 @@ def _around(world: World) -> Target:
     return _to(world, rise_first(hand, (*to, height)), _way(world)[0])
 
 
-def _near(world: World) -> bool:
-    return math.hypot(*(_place_behind(world) - _hand(world)[:2])) < NEAR
-
-
 class Push(Task):
     """Push a puck to a goal. The goal is flat, and the puck is moved by contact alone."""
 
@@ -155,9 +141,9 @@ class Push(Task):
     objects = (PUCK,)
     sizes = (0.055, 0.07)
     rungs = (
-        Rung("at_goal", _at_goal, _stay),
+        Rung("at_goal", lambda w: _way(w)[1] < AT_GOAL, lambda w: Target(*w.ee, _style(w).opening)),
         Rung("push", _pushes, _push),
-        Rung("descend", _near, _around),
+        Rung("descend", lambda w: math.dist(_place_behind(w), _hand(w)[:2]) < NEAR, _around),
         Rung("approach", lambda w: True, _around),
     )
 
@@ -174,13 +160,9 @@ class Push(Task):
         at, height = draw_resting(rng, world, PUCK, ROOM + 0.02), resting_height(world, PUCK)
 
         def fits(goal: F64) -> bool:
-            way = goal - at
-            distance = math.hypot(way[0], way[1])
-            return (
-                distance > FAR
-                and world.reach.has(goal)
-                and world.reach.has(at - ROOM / distance * way)
-            )
+            distance = math.hypot(*(goal - at)[:2])
+            behind = at - ROOM / distance * (goal - at)
+            return distance > FAR and world.reach.has(goal) and world.reach.has(behind)
 
         goal = draw_until(lambda: np.append(draw_xy(rng, world), height), fits, world, "the goal")
         return Start({PUCK: (at, UPRIGHT), GOAL: (np.append(goal[:2], 0.001), UPRIGHT)})
@@ -188,13 +170,13 @@ class Push(Task):
     def observe(self, world: World) -> Observed:
         """Return hand, goal and puck, and the vectors between them."""
         puck, goal = world.at(PUCK), world.goal
-        seen = {
+        return {
+            **observe_hand(world),
             "goal": goal,
             PUCK: puck,
             "puck_from_ee": puck - world.ee.position,
             "goal_from_puck": goal - puck,
         }
-        return {**observe_hand(world), **seen}
 
     def error(self, world: World) -> float:
         """Return the distance of the puck from the goal on the table [m]."""
@@ -202,7 +184,7 @@ class Push(Task):
 
     def progress(self, world: World) -> float:
         """Return progress by the distances left for hand and puck."""
-        if _at_goal(world) or _pushes(world):
+        if self.error(world) < AT_GOAL or _pushes(world):
             return 0.5 + 0.5 * nearness(self.error(world))
         to = np.append(_place_behind(world), world.robot.ee.lowest + LOW)
         return 0.45 * nearness(math.dist(to, _hand(world)))

@@ -9,7 +9,7 @@ from manip_il.robots.geometry import hand_down
 from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.ladder import AT_GOAL, CLOSED, nearness
-from manip_il.tasks.objects import CUBE_HALF, add_goal
+from manip_il.tasks.objects import CUBE_HALF, add_goal, observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_goal
 
 
@@ -45,17 +45,8 @@ class ReachGoal(Task):
 
     def error(self, world: World) -> float:
         """Return the distance of `ee` from the goal [m]."""
-        return math.dist(world.ee.position.tolist(), world.goal.tolist())
+        return math.dist(world.ee.position, world.goal)
 
     def progress(self, world: World) -> float:
         """Return progress by the distance left."""
         return nearness(self.error(world))
-
-
-def observe_hand(world: World) -> Observed:
-    """Return the hand's position and its y and z axes.
-
-    They are the first entries of every `environment_state`.
-    """
-    ee = world.ee
-    return {"ee": ee.position, "ee.axis_y": ee.rotation[:, 1], "ee.axis_z": ee.rotation[:, 2]}

@@ -30,9 +30,15 @@ from manip_il.tasks.ladder import (
     is_held,
     nearness,
 )
-from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, add_furniture
-from manip_il.tasks.pick_place import observe_object
-from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.objects import (
+    BLUE,
+    RED,
+    YELLOW,
+    add_cube,
+    add_furniture,
+    observe_hand,
+    observe_object,
+)
 from manip_il.tasks.starts import FROM_HAND, UPRIGHT, draw_until, draw_yaw, resting_height
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW}
@@ -111,12 +117,12 @@ def _put_back(world: World) -> Target:
     low = z - lie_of(world, name).tall / 2
     centre, row = world.robot.workspace.centre[1], world.at(BINS[name])[1]
     inwards = FROM_BINS - abs(y - row)  # distance to move until it is off the bins
-    way, opening = [0.0, 0.0, -max(0.0, low)], CLOSED if low > 0.008 else world.gripper.most
+    sideways, up = 0.0, -max(0.0, low)
     if inwards > 0:
-        missing = WALL + _HIGH - low
-        sideways = share(1.0 - missing / 0.03) * math.copysign(inwards + 0.02, centre - row)
-        way, opening = [0.0, sideways, missing], CLOSED
-    return Target(world.ee.position + way, hand_down(0.0), opening)
+        up = WALL + _HIGH - low
+        sideways = share(1.0 - up / 0.03) * math.copysign(inwards + 0.02, centre - row)
+    opening = CLOSED if inwards > 0 or low > 0.008 else world.gripper.most
+    return Target(world.ee.position + [0.0, sideways, up], hand_down(0.0), opening)
 
 
 def _free_yaw(world: World) -> float | None:
@@ -125,7 +131,7 @@ def _free_yaw(world: World) -> float | None:
     None if there is room all around.
     """
     x, y, _ = world.at(asked(world)).tolist()
-    along, across, _ = np.array([world.at(one) for one in BINS.values()]).T.tolist()
+    along, across, _ = np.array([world.at(box) for box in BINS.values()]).T.tolist()
     off = abs(y - across[0])
     beyond = max(min(along) - x, x - max(along)) - PITCH / 2
     if off > INSIDE[1] + BY_WALL or beyond > BY_WALL:
@@ -153,23 +159,14 @@ def _middle(world: World) -> tuple[float, float]:
     cube.
     """
     x, y = world.robot.workspace.centre
-    line = [(across, height) for across in (-0.2, -0.1, 0.0, 0.1, 0.2) for height in (0.03, 0.15)]
+    line = [(x, y + across, z) for across in (-0.2, -0.1, 0.0, 0.1, 0.2) for z in (0.03, 0.15)]
     shifts = [
         shift
         for shift in np.arange(-0.35, 0.35, 0.025).tolist()
-        if all(world.reach.has((x + shift, y + across, height)) for across, height in line)
+        if world.reach.has_each(np.array(line) + [shift, 0.0, 0.0]).all()
     ]
     middle = (shifts[0] + shifts[-1]) / 2 if shifts else 0.0
     return x + min(SHIFT, max(-SHIFT, middle)), y
-
-
-def _draw_place(rng: np.random.Generator, world: World, name: str, side: float) -> F64:
-    """Draw a cube's resting place, (3,) [m], away from the bins. side: where the bins are, -1
-    (right) or 1 (left).
-    """
-    (x, y), wide = _middle(world), world.robot.workspace.half_width
-    along, across = rng.uniform(-1, 1) * wide, side * rng.uniform(-BEYOND, SIDE - FROM_BINS)
-    return np.array([x + along, y + across, resting_height(world, name)])
 
 
 _LET_GO, _CARRY = drop_rungs(
@@ -212,7 +209,7 @@ class Sort(Task):
 
         There is none if some bins were moved without the others and do not stand in a row.
         """
-        bins = np.array(sorted(world.at(one).tolist() for one in BINS.values()))
+        bins = np.array(sorted(world.at(box).tolist() for box in BINS.values()))
         row = bins[0] + np.outer(np.arange(len(bins)), [PITCH, 0.0, 0.0])
         return "" if np.abs(bins - row).max() < _IN_ROW else "the bins do not stand in a row"
 
@@ -230,22 +227,23 @@ class Sort(Task):
         """
         number, sentence = float(rng.integers(len(COLOURS))), float(rng.integers(len(SENTENCES)))
         poses: dict[str, tuple[F64, F64]] = {ASKED: (np.array([number, 0.0, sentence]), UPRIGHT)}
-        (x, y), hand = _middle(world), world.robot.workspace.centre
+        (x, y), space = _middle(world), world.robot.workspace
         side = rng.choice([-1.0, 1.0])
         for place, name in enumerate(rng.permutation(list(BINS.values())).tolist()):
             poses[name] = np.array([x + PITCH * (place - 1), y + side * SIDE, 0.0]), UPRIGHT
 
+        def draw_place(name: str) -> F64:  # away from the bins
+            along = rng.uniform(-1, 1) * space.half_width
+            across = side * rng.uniform(-BEYOND, SIDE - FROM_BINS)
+            return np.array([x + along, y + across, resting_height(world, name)])
+
         def fits(at: F64) -> bool:
             others = [poses[name][0] for name in COLOURS if name in poses]
-            from_hand = math.dist(at[:2], hand) > FROM_HAND
-            return (
-                from_hand
-                and world.reach.has(at)
-                and all(math.dist(at, other) > APART for other in others)
-            )
+            apart = all(math.dist(at, other) > APART for other in others)
+            return apart and math.dist(at[:2], space.centre) > FROM_HAND and world.reach.has(at)
 
         for name in COLOURS:
-            at = draw_until(partial(_draw_place, rng, world, name, side), fits, world, name)
+            at = draw_until(partial(draw_place, name), fits, world, name)
             poses[name] = at, draw_yaw(rng)
         return Start(poses)
 
@@ -258,14 +256,10 @@ class Sort(Task):
         return {
             **observe_hand(world),
             **{f"{ASKED}.{other}": float(other == name) for other in COLOURS},
-            **{
-                key.replace(name, "cube", 1): value
-                for key, value in observe_object(world, name).items()
-            },
+            **observe_object(world, name, "cube"),
             "bin_from_cube": world.at(BINS[name]) - world.at(name),
             "place_from_cube": _to(world) - world.at(name),
-            **{other: world.at(other) for other in COLOURS},
-            **{one: world.at(one) for one in BINS.values()},
+            **{body: world.at(body) for body in (*COLOURS, *BINS.values())},
         }
 
     def error(self, world: World) -> float:
@@ -284,7 +278,7 @@ class Sort(Task):
         """
         name = asked(world)
         if _is_sorted(world, name):
-            return 1.0 if not _wrong(world) else 0.95
+            return 0.95 if _wrong(world) else 1.0
         if is_held(world, name):
             along, across, up = (_place(world) - world.at(name)).tolist()
             lift = OVER_WALL.over(max(0.0, math.hypot(along, across) - INSIDE[0]))

@@ -18,9 +18,7 @@ from manip_il.tasks.ladder import (
     is_held,
     let_go,
 )
-from manip_il.tasks.objects import BLUE, RED, add_cube
-from manip_il.tasks.pick_place import observe_object
-from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.objects import BLUE, RED, add_cube, observe_hand, observe_object
 from manip_il.tasks.starts import draw_resting, draw_until, draw_yaw
 
 TOP, BASE = "top", "base"  # the cube that is carried, and the one that it is put on
@@ -60,16 +58,12 @@ def _rests(world: World) -> bool:
 
 
 def _is_on_base(world: World, height: float) -> bool:
-    x, y, z = (world.at(TOP) - place_on_base(world)).tolist()
+    x, y, z = world.at(TOP) - place_on_base(world)
     return math.hypot(x, y) < ON_XY and abs(z) < height
 
 
 def _hand_is_away(world: World) -> bool:
-    return bool(world.ee.position[2] > world.at(TOP)[2] + grasp_of(world, TOP).half + AWAY_ENOUGH)
-
-
-def _carry(world: World) -> Target:
-    return carry(world, TOP, place_on_base(world) - [0.0, 0.0, PRESS], OVER_BASE)
+    return world.ee.position[2] > world.at(TOP)[2] + grasp_of(world, TOP).half + AWAY_ENOUGH
 
 
 def _let_go(world: World) -> Target:
@@ -89,7 +83,11 @@ class Stack(Task):
     rungs = (
         Rung("done", lambda w: stands(w) and _hand_is_away(w), _let_go),
         Rung("let_go", lambda w: stands(w) or _rests(w), _let_go),
-        Rung("carry", lambda w: is_held(w, TOP), _carry),
+        Rung(
+            "carry",
+            lambda w: is_held(w, TOP),
+            lambda w: carry(w, TOP, place_on_base(w) - [0.0, 0.0, PRESS], OVER_BASE),
+        ),
         *grasp_rungs(lambda w: TOP),
     )
 
@@ -135,11 +133,8 @@ class Stack(Task):
     def progress(self, world: World) -> float:
         """Return progress of grasping, carrying and letting go."""
         if stands(world):
-            return (
-                1.0
-                if _hand_is_away(world)
-                else 0.9 + 0.1 * min(1.0, world.opening / world.gripper.most)
-            )
+            opened = min(1.0, world.opening / world.gripper.most)
+            return 1.0 if _hand_is_away(world) else 0.9 + 0.1 * opened
         if is_held(world, TOP):
             return 0.5 + 0.4 * carry_progress(world, TOP, place_on_base(world), OVER_BASE)
         return 0.45 * grasp_progress(world, TOP)

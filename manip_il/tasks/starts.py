@@ -1,6 +1,6 @@
 """Random starts within an arm's reach."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -15,10 +15,7 @@ UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # wxyz
 # least horizontal distance from hand to object, as in gymnasium-robotics' FetchPickAndPlace [m]
 FROM_HAND = 0.1
 FROM_HAND_SHARE = 0.75  # the same as a share of the workspace's half width, if that is less
-# workspace height from which the full `LIFT` is used; lower workspaces scale it down [m]
-LIFT_HEIGHT = 0.45
 IN_AIR = 0.5  # share of goals above the table, as in FetchPickAndPlace
-LIFT = (0.1, 0.25)  # height of a goal above the object's start [m]
 FEW_DRAWS = 50  # draws of one place before the other places are drawn again, too
 _MOST_DRAWS = 1_000
 _BOX, _SPHERE, _CAPSULE = (
@@ -26,7 +23,7 @@ _BOX, _SPHERE, _CAPSULE = (
 )
 _HALF = np.sqrt(0.5)
 # turn x, y or z up
-_UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.0]), UPRIGHT)
+UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.0]), UPRIGHT)
 
 
 def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, F64]:
@@ -47,23 +44,19 @@ def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, 
     Raises:
         UsageError: If no place fits within the arm's reach.
     """
-    lengths = world.extents(name)
-    if (hull := world.hull(name)) is not None:
-        at = draw_resting_place(rng, world, name, hull.rest(0).height)
-        return at, product(draw_yaw(rng, np.pi), _upright(hull.downs[0]))
     if is_cube(world, name):
         return draw_resting(rng, world, name), draw_yaw(rng)
-    sides = _sides(world.kind(name), lengths)
-    up = sides[int(rng.integers(len(sides)))]
-    at = draw_resting_place(rng, world, name, lengths[up] / 2)
-    return at, product(draw_yaw(rng, np.pi), _UPWARDS[up])
-
-
-def _upright(down: F64) -> F64:
-    """Return the smallest rotation, wxyz, that makes a direction (3,) of an object point down."""
-    turn = np.empty(4)
-    mujoco.mju_quatZ2Vec(turn, -down)
-    return turn * [1.0, -1.0, -1.0, -1.0]
+    if (hull := world.hull(name)) is not None:
+        height, turn = hull.rest(0).height, np.empty(4)
+        mujoco.mju_quatZ2Vec(turn, -hull.downs[0])
+        turn *= [1.0, -1.0, -1.0, -1.0]  # the smallest rotation that turns this side down
+    else:
+        lengths = world.extents(name)
+        sides = _sides(world.kind(name), lengths)
+        up = sides[int(rng.integers(len(sides)))]
+        height, turn = lengths[up] / 2, UPWARDS[up]
+    at = draw_resting(rng, world, name, height=height)
+    return at, product(draw_yaw(rng, np.pi), turn)
 
 
 def _sides(kind: int, lengths: Sequence[float]) -> list[int]:
@@ -77,48 +70,35 @@ def _sides(kind: int, lengths: Sequence[float]) -> list[int]:
     ]
 
 
-def draw_resting(rng: np.random.Generator, world: World, name: str, room: float = 0.0) -> F64:
+def draw_resting(
+    rng: np.random.Generator,
+    world: World,
+    name: str,
+    room: float = 0.0,
+    height: float | None = None,
+) -> F64:
     """Draw a place where an object's centre is at rest, not under the hand, (3,) [m].
 
     Args:
         rng: The source of random numbers.
         world: The world, for the arm's reach and the object's height.
         name: The object's name.
-        room: The margin around the place that must also be within reach, see `draw_resting_place`
-            [m].
-
-    Raises:
-        UsageError: If no place fits within the arm's reach.
-    """
-    return draw_resting_place(rng, world, name, resting_height(world, name), room)
-
-
-def draw_resting_place(
-    rng: np.random.Generator, world: World, name: str, height: float, room: float = 0.0
-) -> F64:
-    """Draw a place at a height over the table, away from the hand's start, (3,) [m].
-
-    Args:
-        rng: The source of random numbers.
-        world: The world, for the arm's workspace and reach.
-        name: What the place is for, which an error names.
-        height: The height of the place over the table [m].
         room: The margin around the place that must also be within reach, so that a knocked object
             stays within reach [m].
+        height: The height of the place over the table, by default `resting_height` [m].
 
     Raises:
         UsageError: If no place fits within the arm's reach.
     """
-    space = world.robot.workspace
-    centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
+    space, z = world.robot.workspace, resting_height(world, name) if height is None else height
+    apart = min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
 
     def fits(at: F64) -> bool:
         around = ((0, 0, 0), (room, 0, 0), (-room, 0, 0), (0, room, 0), (0, -room, 0))
-        return bool(np.linalg.norm(at[:2] - centre) >= apart) and all(
-            world.reach.has(at + way) for way in around
-        )
+        from_hand = float(np.linalg.norm(at[:2] - space.centre))
+        return from_hand >= apart and all(world.reach.has(at + way) for way in around)
 
-    return draw_until(lambda: np.append(draw_xy(rng, world), height), fits, world, name)
+    return draw_until(lambda: np.append(draw_xy(rng, world), z), fits, world, name)
 
 
 def draw_goal(rng: np.random.Generator, world: World, height: float, in_air: float = IN_AIR) -> F64:
@@ -181,40 +161,10 @@ def draw_until[T](draw: Callable[[], T], fits: Callable[[T], bool], world: World
     )
 
 
-def draw_together(
-    draw: Callable[[str], F64],
-    names: Iterable[str],
-    fits: Callable[[F64, Sequence[F64]], bool],
-    world: World,
-) -> list[F64]:
-    """Draw a place for each name that fits the places drawn before it.
-
-    If no such place is found for a name, all places are drawn again.
-
-    Args:
-        draw: Draws a place for a name, (3,) [m].
-        names: The names, in the order in which their places are drawn.
-        fits: Returns whether a place fits, given the earlier places.
-        world: The world, whose task and robot an error names.
-
-    Returns:
-        The places, (3,) [m] each, in the order of the names.
-
-    Raises:
-        UsageError: If none of a thousand attempts succeeds.
-    """
-
-    def draw_all() -> list[F64]:
-        places: list[F64] = []
-        for name in names:
-            drawn = (draw(name) for _ in range(FEW_DRAWS))
-            at = next((at for at in drawn if fits(at, places)), None)
-            if at is None:
-                return []
-            places.append(at)
-        return places
-
-    return draw_until(draw_all, bool, world, ", ".join(names))
+def draw_few(draw: Callable[[], F64], fits: Callable[[F64], bool]) -> F64 | None:
+    """Return the first of a few draws that fits; None if none does, and others must be redrawn."""
+    drawn = (draw() for _ in range(FEW_DRAWS))
+    return next((place for place in drawn if fits(place)), None)
 
 
 def resting_height(world: World, name: str) -> float:

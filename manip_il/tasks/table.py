@@ -7,10 +7,10 @@ names its task: what these store is a `str`, which is a name.
 
 import hashlib
 import inspect
+from collections.abc import Callable
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
 
 from manip_il import checks
 from manip_il.errors import UnknownName, UsageError
@@ -31,20 +31,21 @@ from manip_il.tasks.stack import Stack
 
 SUFFIX = ".py"
 GROUP = "manip_il.tasks"  # entry-point group: maps a task's name to its class
-TASKS: dict[str, Task] = {
-    "reach": ReachGoal(),
-    "lift": Lift(),
-    "pick_place": PickPlace(),
-    "push": Push(),
-    "press": Press(),
-    "stack": Stack(),
-    "drawer": Drawer(),
-    "clear_table": ClearTable(),
-    "insert": Insert(),
-    "insert_tight": Insert("insert_tight", play=0.0005),
-    "sort": Sort(),
-    "carry": Carry(),
-}
+SHIPPED: tuple[Task, ...] = (
+    ReachGoal(),
+    Lift(),
+    PickPlace(),
+    Push(),
+    Press(),
+    Stack(),
+    Drawer(),
+    ClearTable(),
+    Insert(),
+    Insert("insert_tight", play=0.0005),
+    Sort(),
+    Carry(),
+)
+TASKS = {task.name: task for task in SHIPPED}
 
 
 def get_task(name: NameOrPath, shape: NameOrPath = "") -> Task:
@@ -81,7 +82,7 @@ def is_task(name: str) -> bool:
     The task's code is not run.
     """
     base = name.partition(":")[0]
-    return base in TASKS or _entry_point(base) is not None
+    return base in TASKS or bool(entry_points(group=GROUP, name=base))
 
 
 def source_hash(task: Task) -> str:
@@ -93,20 +94,10 @@ def source_hash(task: Task) -> str:
 def _named(name: str) -> Task:
     if name in TASKS:
         return TASKS[name]
-    entry = _entry_point(name)
-    if entry is None:
+    found = tuple(entry_points(group=GROUP, name=name))
+    if not found:
         raise UnknownName("task", name, (*TASKS, "the path of a Python file"))
-    try:
-        cls = entry.load()
-    except Exception as error:
-        raise UsageError(
-            f"{name} of {entry.value} cannot be imported: {checks.one_line(error)}"
-        ) from error
-    return _made(f"task {name} of {entry.value}", cls)
-
-
-def _entry_point(name: str) -> EntryPoint | None:
-    return next(iter(entry_points(group=GROUP, name=name)), None)
+    return _made(f"task {name} of {found[0].value}", lambda: found[0].load()())
 
 
 @cache
@@ -121,9 +112,9 @@ def _of_file(path: Path) -> Task:
     return task
 
 
-def _made(what: str, cls: Any) -> Task:
+def _made(what: str, make: Callable[[], Task]) -> Task:
     try:
-        task = cls()
+        task = make()
         checks.name("its name", task.name)
         _ = task.instruction, task.rungs  # both must be there
     except Exception as error:

@@ -15,7 +15,7 @@ from manip_il.mdp import F64, State
 from manip_il.robots.spec import model_bytes
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.props import VERSION as DRAWN
+from manip_il.sim.render import LOOK_VERSION as DRAWN
 from manip_il.worlds.config import WORLDS, EnvConfig
 from manip_il.worlds.contract import (
     Ability,

@@ -54,7 +54,8 @@ def test_it_learns_who_acted(kind):
 
 def test_the_reward_prefers_the_expert():
     d, _ = trained("gail")
-    expert, learner = (d.reward(rows(action, seed=7)).mean() for action in (0.5, -0.5))
+    logs = np.zeros(N, np.float32)
+    expert, learner = (d.reward(rows(action, seed=7), logs).mean() for action in (0.5, -0.5))
     assert expert > 0 > learner
 
 

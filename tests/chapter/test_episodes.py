@@ -56,15 +56,6 @@ def test_an_episode_that_has_ended_leaves_the_others_as_they_are():
     assert beside.simulated == 4
 
 
-def test_an_episode_depends_on_its_seed_alone():
-    alone, beside = lockstep(1), lockstep(3)
-    assert np.array_equal(alone.start(7)[0], beside.start(5)[2])
-    for step in range(3):
-        action = up(0.01 * step)
-        three = np.stack([up(0.03), up(-0.01), action])
-        assert np.array_equal(alone.step(action[None])[0], beside.step(three)[2])
-
-
 def test_time_is_the_last_number():
     env = lockstep(2, hold=None)
     env.start(1)

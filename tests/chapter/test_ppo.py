@@ -43,14 +43,6 @@ def test_the_density_is_that_of_the_policy_network_above_its_mean():
     np.testing.assert_allclose(ours, (theirs - constant).numpy() + entropy, rtol=1e-4, atol=1e-4)
 
 
-def test_of_the_actors_own_actions_the_density_is_at_its_mean():
-    one = learner()
-    seed_generators(0)
-    rows = one.collect(0)
-    live = one.log_prob(rows)[~rows.absorbing]
-    assert abs(live.mean()) < 4 * live.std() / np.sqrt(len(live)) + 0.05
-
-
 def test_in_the_absorbing_state_every_action_is_as_likely():
     one = learner()
     states = np.zeros((2, 4), np.float32)

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from manip_il.chapter import episodes
 from manip_il.chapter.episodes import Demonstrations, read_demonstrations
@@ -37,35 +36,15 @@ def test_a_demonstration_that_fills_the_episode_still_ends_in_the_absorbing_stat
     assert rows.next_states[-1].tolist() == [0, 0, 0, 1]
 
 
-@pytest.fixture
-def read(monkeypatch):
-    """Reads a table in place of a dataset."""
-
-    def run(**changes):
-        table = make_table()
-        table["label_valid"] = table["label_valid"].reshape(-1)
-        table["actor"] = np.full(EPISODES * LENGTH, Actor.EXPERT)
-        table["next.success"] = np.tile(np.arange(LENGTH) >= LENGTH - 5, EPISODES)
-        table |= {name.replace("__", "."): value for name, value in changes.items()}
-        monkeypatch.setattr(
-            episodes, "joined_columns", lambda roots, names: {name: table[name] for name in names}
-        )
-        return read_demonstrations([Path("demos")], lambda actions, states: actions - states)
-
-    return run
-
-
-def test_the_steps_after_success_are_those_of_the_demonstrations(read):
-    found = read()
-    assert (len(found.inputs), found.longest, found.hold) == (EPISODES, LENGTH, 4)
+def test_only_whole_successful_episodes_of_the_expert_with_labels_are_read(monkeypatch):
+    table = make_table()
+    table["label_valid"] = np.ones(EPISODES * LENGTH, np.int64)
+    table["actor"] = np.full(EPISODES * LENGTH, Actor.EXPERT)
+    table["next.success"] = np.tile(np.arange(LENGTH) >= LENGTH - 5, EPISODES)
+    table["actor"][0] = Actor.LEARNER
+    table["next.success"][LENGTH : 2 * LENGTH] = False
+    table["label_valid"][2 * LENGTH] = 0
+    monkeypatch.setattr(episodes, "joined_columns", lambda roots, names: table)
+    found = read_demonstrations([Path("demos")], lambda actions, states: actions - states)
+    assert (len(found.inputs), found.longest, found.hold) == (EPISODES - 3, LENGTH, 4)
     assert found.inputs[0].shape == (LENGTH, 10)
-
-
-def test_episodes_that_a_learner_drove_or_that_failed_or_have_no_label_are_left_out(read):
-    actor = np.full(EPISODES * LENGTH, Actor.EXPERT)
-    actor[0] = Actor.LEARNER
-    success = np.tile(np.arange(LENGTH) >= LENGTH - 5, EPISODES)
-    success[LENGTH : 2 * LENGTH] = False
-    valid = np.ones(EPISODES * LENGTH, np.int64)
-    valid[2 * LENGTH] = 0
-    assert len(read(actor=actor, next__success=success, label_valid=valid).inputs) == EPISODES - 3

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from manip_il.errors import RenderError
-from manip_il.evaluation import runner
+from manip_il.evaluation import measuring
+from manip_il.evaluation.runner import finished_episodes
 
 from .made_runs import make_policy
 
@@ -41,14 +42,14 @@ def policy(tmp_path_factory) -> Path:
 def evaluated(monkeypatch) -> list[str]:
     """The policies of which episodes were run, by name."""
     names: list[str] = []
-    real = runner.evaluate
+    real = measuring.measure
 
-    def counted(engine, job, seeds, name, *rest, done=None, **named):
-        if set(seeds) - (done or {}).keys():
+    def counted(engine, job, seeds, name, progress, *, folder, suite, **named):
+        if set(seeds) - finished_episodes(folder, job, suite).keys():
             names.append(name)
-        return real(engine, job, seeds, name, *rest, done=done, **named)
+        return real(engine, job, seeds, name, progress, folder=folder, suite=suite, **named)
 
-    monkeypatch.setattr(runner, "evaluate", counted)
+    monkeypatch.setattr(measuring, "measure", counted)
     return names
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from manip_il.cli.imitation import DaggerOptions
+from manip_il.cli.main import main
 from manip_il.cli.outputs import save_options
 from manip_il.collect.job import HOLD
 from manip_il.data import schema
@@ -24,6 +25,11 @@ from ..learn.tiny_policies import write_checkpoint
 ENV = make_config("panda", "reach", horizon=8)
 OPTIONS = DaggerOptions(env={"task": "reach", "horizon": 8})
 SUCCESSES = (0.2, 0.6, 0.4)
+
+
+def run(line: str, *words: str) -> int:
+    """Run `manip-il` with the words of a line, and more; return the exit code."""
+    return main([*line.split(), *words])
 
 
 def files(root: Path) -> dict[str, bytes]:

@@ -34,10 +34,7 @@ TINY_DAGGER = [
 
 def record(root: Path, episodes: int, *words: str) -> list[str]:
     return [
-        "record",
-        f"--dataset.root={root}",
-        f"--dataset.num_episodes={episodes}",
-        "--workers=1",
+        *f"record --dataset.root={root} --dataset.num_episodes={episodes} --workers=1".split(),
         *words,
     ]
 
@@ -52,13 +49,9 @@ def demos(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def policy(demos, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "t"
-    words = [
-        "train",
-        f"--dataset.root={demos}",
-        "--steps=20",
-        "--policy.width=16",
-        f"--output_dir={folder}",
-    ]
+    words = (
+        f"train --dataset.root={demos} --steps=20 --policy.width=16 --output_dir={folder}"
+    ).split()
     assert main(words) == 0
     return folder
 
@@ -108,13 +101,7 @@ def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
 
 
 def test_train_to_eval(policy, tmp_path, capsys, error):
-    words = [
-        "eval",
-        f"--policy.path={policy}",
-        "--eval.n_episodes=2",
-        "--workers=1",
-        "--eval.films=0",
-    ]
+    words = f"eval --policy.path={policy} --eval.n_episodes=2 --workers=1 --eval.films=0".split()
     words += [f"--output_dir={tmp_path / 'e'}"]
     assert main(words) == 0
     out, err = capsys.readouterr()

@@ -7,6 +7,7 @@ import pytest
 from manip_il.cli.main import COMMANDS, main
 
 from . import fake_command
+from .made_runs import run
 
 
 @pytest.fixture(autouse=True)
@@ -79,7 +80,7 @@ def test_help_holds_options_defaults_and_an_example(words, capsys):
 
 
 def test_words_behind_two_dashes_are_another_programs(capsys):
-    assert main(["serve", "--speed=0", "--", "lerobot-record", "--help", "--debug"]) == 2
+    assert run("serve --speed=0 -- lerobot-record --help --debug") == 2
     assert capsys.readouterr().err == "manip-il: error: --speed is 0.0; expected 0.1 to 10\n"
 
 

@@ -87,8 +87,9 @@ MISTAKES = {
     "data chekc a": "unknown command 'data chekc' (did you mean 'data check'?); known: ",
     "train": "--dataset.root is missing",
     "train --dataset.root=missing": "missing does not exist; expected a LeRobot v3.0 dataset",
+    "data check missing": "missing does not exist; expected a LeRobot v3.0 dataset",
     f"train --dataset.root={ROOT / 'docs'}": "is not a LeRobot dataset: meta/info.json is missing",
-    "train --dataset.root=lerobot/pusht": "manip-il pull hf://datasets/lerobot/pusht FOLDER",
+    "train --dataset.root=lerobot/pusht": "manip-il pull hf://datasets/USER/NAME FOLDER",
     f"{TRAIN} --policy.path=missing": "no policy in missing",
     f"{TRAIN} --policy=act": "did you mean '--policy.NAME'",
     f"{TRAIN} --action_space=ee_detla": (
@@ -98,11 +99,11 @@ MISTAKES = {
     f"{TRAIN} --policy.type=akt --observation=images": "unknown policy 'akt' (did you mean 'act'?)",
     "eval": "--policy.path=DIR",
     "eval --policy.path=lerobot/act_aloha": "manip-il pull hf://lerobot/act_aloha FOLDER",
-    "eval missing --replay=1": "missing does not exist; expected evaluations: one with --replay",
+    "eval missing --replay=1": "cannot read missing: No such file or directory; expected an eval.json",
     "eval SAMPLE": "expected two or more evaluations to merge, or one and --replay=SEED",
     f"{EXPERT} --suite=nominall": "did you mean 'nominal'?",
     f"{EXPERT} --until_width=2": "--until_width is 2.0; expected 0.0001 to 1",
-    "compare a b": "a does not exist; expected two sides, each an eval.json, a policy",
+    "compare a b": "no policy in a; expected LeRobot's pretrained_model folder",
     "record --robot.type=pandas": (
         "unknown robot 'pandas' (did you mean 'panda'?); known: fetch, panda"
     ),
@@ -120,14 +121,12 @@ MISTAKES = {
     "dagger --hold=-1": "hold is -1; expected at least 0",
     "dagger --policy.type=act --query=one": "use label=branch or label=takeover",
     "data check": "DATASET is missing",
-    "data render SAMPLE x --look.brightness=9": (
-        "brightness is 9.0; expected a factor from 0.1 to 2.0"
-    ),
+    "data render SAMPLE x --look.brightness=9": ("brightness is 9.0; expected 0.1 to 2"),
     "data redraw SAMPLE SAMPLE --overwrite=true": "overlaps",
     "push SAMPLE": "REMOTE is missing",
-    "push missing hf://me/x": "missing does not exist; expected a dataset, a run or a policy",
+    "push missing hf://me/x": "missing is neither a LeRobot dataset",
     "view --policy.type=slider": "--policy.type: expected expert|random|sliders, got 'slider'",
-    "robot new missing.xml": "missing.xml does not exist; expected the arm's MJCF",
+    "robot new missing.xml": "missing.xml: No such file or directory; expected an MJCF",
     "robot certify --cases=2000000": "--cases is 2000000; expected 1 to 1,000,000",
     "theory missing": "a run of manip-il dagger",
 }

@@ -9,6 +9,7 @@ from manip_il.cli.main import main
 from manip_il.data.dataset import Dataset
 
 from ..robots.own import write
+from .made_runs import run
 
 REACH = ("--task.type=reach", "--workers=1")
 SHORT = (
@@ -34,18 +35,13 @@ def test_it_is_recorded_learnt_evaluated_improved_and_rendered(
     assert [one.name for one in tmp_path.iterdir()] == ["arms"]
     assert main(["record", robot, *REACH, "--dataset.num_episodes=2"]) == 0
     assert Dataset.open(Path("datasets/mine_reach")).spec.robot == "mine"
-    assert (
-        main(["train", "--dataset.root=datasets/mine_reach", "--steps=2", "--output_dir=run"]) == 0
-    )
+    assert run("train --dataset.root=datasets/mine_reach --steps=2 --output_dir=run") == 0
     assert "warning" not in capsys.readouterr().err
     words = [
         "eval",
         robot,
         *REACH,
-        "--policy.path=run",
-        "--eval.n_episodes=1",
-        "--eval.films=0",
-        "--output_dir=test",
+        *["--policy.path=run", "--eval.n_episodes=1", "--eval.films=0", "--output_dir=test"],
     ]
     assert main(words) == 0
     assert json.loads(Path("test/eval.json").read_text())["robot"] == "mine"

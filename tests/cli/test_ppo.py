@@ -39,10 +39,7 @@ def test_a_run_ends_with_a_policy_metrics_and_a_page(here, cloned, capsys):
     reward(here / "reward")
     small = "--steps=1 --episodes=2 --episode_steps=4 --warmup=0 --ppo.minibatches=1 --ppo.epochs=1"
     words = [
-        "rl",
-        "ppo",
-        f"--init={cloned}",
-        "--reward=reward",
+        *f"rl ppo --init={cloned} --reward=reward".split(),
         *small.split(),
         "--validation_episodes=1",
     ]

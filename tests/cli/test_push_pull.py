@@ -40,7 +40,7 @@ def test_there_and_back_and_again_nothing_travels(run, url, tmp_path, capsys):
 
 
 def test_dry_runs_only_say(run, url, tmp_path, capsys):
-    assert main(["push", str(run), url, "--dry-run"]) == 0
+    assert main(["push", str(run), url, "--dry_run"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "upload   config.yaml",
         "upload   metrics.jsonl",
@@ -49,7 +49,7 @@ def test_dry_runs_only_say(run, url, tmp_path, capsys):
     assert not (tmp_path / "store").exists()
     main(["push", str(run), url])
     capsys.readouterr()
-    assert main(["pull", url, str(tmp_path / "got"), "--dry-run=true"]) == 0
+    assert main(["pull", url, str(tmp_path / "got"), "--dry_run=true"]) == 0
     assert (
         capsys.readouterr()
         .out.splitlines()[-1]

@@ -19,16 +19,14 @@ from manip_il.sim.config import Look
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..pictures import read_episodes
-from .made_runs import files
+from .made_runs import files, run
 
 
 def record(root: Path, *words: str) -> list[str]:
     return [
-        "record",
-        "--robot.type=fetch",
-        f"--dataset.root={root}",
-        "--dataset.num_episodes=3",
-        "--workers=1",
+        *(
+            f"record --robot.type=fetch --dataset.root={root} --dataset.num_episodes=3 --workers=1"
+        ).split(),
         *words,
     ]
 
@@ -50,14 +48,8 @@ def test_resuming_what_never_began_begins(recorded, tmp_path, capsys):
     assert files(tmp_path / "demos") == files(recorded)
 
 
-def test_a_folder_that_no_journals_made_is_not_continued(tmp_path):
-    (tmp_path / "demos" / "thesis").mkdir(parents=True)
-    assert main(record(tmp_path / "demos", "--resume=true")) == 2
-    assert (tmp_path / "demos" / "thesis").is_dir()
-
-
 def test_the_journals_give_the_datasets_bytes_again(recorded, tmp_path):
-    assert main(["data", "build", str(journals_of(recorded)), str(tmp_path / "again")]) == 0
+    assert run(f"data build {journals_of(recorded)} {tmp_path / 'again'}") == 0
     assert files(tmp_path / "again") == files(recorded)
 
 
@@ -68,7 +60,7 @@ def test_a_damaged_journal_is_named_and_its_seed_runs_again_once_it_is_deleted(
     shutil.copytree(journals_of(recorded), journals)
     cut = list_episodes(journals)[1]
     cut.write_bytes(cut.read_bytes()[: cut.stat().st_size // 2])
-    assert main(["data", "build", str(journals), str(tmp_path / "x")]) == 1
+    assert run(f"data build {journals} {tmp_path / 'x'}") == 1
     assert f"error: {cut} is not a complete episode" in capsys.readouterr().err
     cut.unlink()
     assert (
@@ -92,7 +84,7 @@ def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_o
     assert '"video.crf": 20' in (tmp_path / "one/meta/info.json").read_text()
     assert main(record(tmp_path / "two", *pictured, "--workers=2")) == 0
     assert files(tmp_path / "one") == files(tmp_path / "two")
-    assert main(["data", "build", str(journals_of(tmp_path / "one")), str(tmp_path / "again")]) == 0
+    assert run(f"data build {journals_of(tmp_path / 'one')} {tmp_path / 'again'}") == 0
     assert files(tmp_path / "again") == files(tmp_path / "one")
     frames = Dataset.open(tmp_path / "one").columns(["index"])["index"]
     episodes = list(read_episodes(tmp_path / "one"))
@@ -104,10 +96,7 @@ def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_o
         assert len(np.unique(decoded)) > 50  # something is to be seen
     [video, _] = (tmp_path / "again").rglob("*.mp4")
     video.write_bytes(video.read_bytes()[:-1000])
-    assert main(["data", "check", str(tmp_path / "again")]) == 1
-    shutil.copytree(journals_of(tmp_path / "one"), journals_of(tmp_path / "again"))
-    assert main(["data", "repair", str(tmp_path / "again")]) == 0
-    assert files(tmp_path / "again") == files(tmp_path / "one")
+    assert run(f"data check {tmp_path / 'again'}") == 1
 
 
 ENV = make_config("panda", "reach", horizon=6, success_steps=1)
@@ -130,9 +119,9 @@ def test_two_workers_write_the_bytes_of_one(demos):
         "--look.shadows=true",
         "--look.light_turn=30",
     ]
-    assert main(["data", "render", "demos", "one", "--workers=1", *words]) == 0
+    assert run("data render demos one --workers=1", *words) == 0
     Path("again").mkdir()
-    assert main(["data", "render", "demos", "again/one", "--workers=2", *words]) == 0
+    assert run("data render demos again/one --workers=2", *words) == 0
     assert files(Path("one")) == files(Path("again/one"))
     assert Dataset.open(Path("one")).provenance["rendered"]["cameras"]["look"] == asdict(
         Look(shadows=True, light_turn=30)
@@ -147,6 +136,6 @@ def test_without_opengl_what_was_there_stays(demos, error, monkeypatch):
     monkeypatch.setattr("mujoco.egl.GLContext", broken)
     shutil.copytree("demos", "x")
     before = files(Path())
-    assert main(["data", "render", "demos", "x", "--workers=1", "--overwrite=true", "--quiet"]) == 1
+    assert run("data render demos x --workers=1 --overwrite=true --quiet") == 1
     assert "no off-screen OpenGL (ImportError: cannot load libEGL.so.1); " in error()
     assert files(Path()) == before

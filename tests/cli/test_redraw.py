@@ -12,6 +12,7 @@ from manip_il.cli.main import main
 from manip_il.data.dataset import Dataset
 
 from ..damage import digests
+from .made_runs import run
 
 SMALL = ("--frames=60", "--image.height=32", "--image.width=32", "--workers=1", "--quiet")
 
@@ -19,16 +20,14 @@ SMALL = ("--frames=60", "--image.height=32", "--image.width=32", "--workers=1", 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("demos") / "demos"
-    assert (
-        main(["record", f"--dataset.root={root}", "--dataset.num_episodes=3", "--workers=1"]) == 0
-    )
+    assert run(f"record --dataset.root={root} --dataset.num_episodes=3 --workers=1") == 0
     return root
 
 
 @pytest.fixture(scope="module")
 def redrawn(demos, tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("redrawn") / "new"
-    assert main(["data", "redraw", str(demos), str(root), *SMALL]) == 0
+    assert run(f"data redraw {demos} {root}", *SMALL) == 0
     return root
 
 
@@ -50,7 +49,7 @@ def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
         assert ((places >= 0) & (places <= 1)).all()
         assert places.reshape(60, -1, 3)[:, :2, 2].any()
     assert Dataset.open(redrawn).columns(["label_valid"])["label_valid"].all()
-    assert main(["data", "check", str(redrawn)]) == 0
+    assert run(f"data check {redrawn}") == 0
     dataset: Any = LeRobotDataset("local/new", root=redrawn)
     assert dataset[7]["observation.images.side"].shape == (3, 32, 32)
     inputs = dataset_to_policy_features(dataset.meta.features)
@@ -63,22 +62,18 @@ def test_without_pictures_it_gives_the_same_scenes_and_a_cnn_learns_to_act_from_
     redrawn, demos, tmp_path
 ):
     states, policy = tmp_path / "states", tmp_path / "policy"
-    assert main(["data", "redraw", str(demos), str(states), "--pictures=false", *SMALL]) == 0
+    assert run(f"data redraw {demos} {states} --pictures=false", *SMALL) == 0
     assert Dataset.open(states).spec.cameras == ()
     seen, unseen = (Dataset.open(one).columns(["sim_state", "action"]) for one in (redrawn, states))
     assert all((seen[name] == unseen[name]).all() for name in seen)
-    words = ["train", f"--dataset.root={redrawn}", "--policy.type=cnn", f"--policy.states={states}"]
+    words = f"train --dataset.root={redrawn} --policy.type=cnn --policy.states={states}".split()
     assert (
-        main([*words, "--policy.width=16", "--steps=2", "--batch_size=4", f"--output_dir={policy}"])
+        main([*words, *f"--policy.width=16 --steps=2 --batch_size=4 --output_dir={policy}".split()])
         == 0
     )
-    words = [
-        "eval",
-        f"--policy.path={policy}",
-        "--eval.n_episodes=1",
-        "--env.horizon=10",
-        "--workers=1",
-    ]
+    words = (
+        f"eval --policy.path={policy} --eval.n_episodes=1 --env.horizon=10 --workers=1"
+    ).split()
     assert main([*words, f"--output_dir={tmp_path / 'eval'}"]) == 0
 
 
@@ -88,13 +83,9 @@ def test_dagger_by_pictures_redraws_every_rounds_states_the_same_after_a_kill(
     demos, tmp_path, capsys
 ):
     run = tmp_path / "run"
-    words = [
-        "dagger",
-        f"--dataset.root={demos}",
-        "--policy.type=cnn",
-        "--policy.width=16",
-        "--redraw=60",
-    ]
+    words = (
+        f"dagger --dataset.root={demos} --policy.type=cnn --policy.width=16 --redraw=60"
+    ).split()
     words += [
         "--rounds=1",
         "--episodes_per_round=2",

@@ -13,6 +13,7 @@ from manip_il.robots import reach
 from manip_il.robots.table import get_robot
 
 from ..robots.own import model_of, tree_of, write
+from .made_runs import run
 
 
 @pytest.fixture
@@ -39,23 +40,10 @@ def no_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_without_opengl_the_page_says_so(own: Path, tmp_path: Path, no_opengl: None, capsys):
     out = tmp_path / "out"
-    assert (
-        main(
-            [
-                "--quiet",
-                "robot",
-                "check",
-                str(own),
-                "--tasks=reach",
-                "--episodes=0",
-                f"--output_dir={out}",
-            ]
-        )
-        == 0
-    )
+    assert run(f"--quiet robot check {own} --tasks=reach --episodes=0 --output_dir={out}") == 0
     said = capsys.readouterr()
     assert "own has starts for 1 of 1 tasks; the expert was not run." in said.out
-    page, found = (out / "check.html").read_text(), json.loads((out / "check.json").read_text())
+    page, found = (out / "report.html").read_text(), json.loads((out / "check.json").read_text())
     assert "No pictures: no off-screen OpenGL" in page
     facts = {"task": "reach", "done": True, "starts": 50, "refused": ""}
     assert found["tasks"] == [facts | {"clean": None, "noisy": None}]
@@ -65,15 +53,9 @@ def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_op
     tree = tree_of()
     tree["gripper"]["open"] = [0.02, 0.02]
     path, out = with_map(write(tmp_path, "narrow", tree=tree)), tmp_path / "out"
-    words = [
-        "--quiet",
-        "robot",
-        "check",
-        str(path),
-        "--tasks=reach,lift",
-        "--episodes=0",
-        f"--output_dir={out}",
-    ]
+    words = (
+        f"--quiet robot check {path} --tasks=reach,lift --episodes=0 --output_dir={out}"
+    ).split()
     assert main(words) == 1
     said = capsys.readouterr()
     assert (
@@ -81,7 +63,7 @@ def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_op
     )
     assert "change: lift: task lift: 'object' is 0.050 m wide" in said.out
     assert "cannot do 1 of 2 tasks: lift" in said.err
-    assert (out / "check.html").is_file()
+    assert (out / "report.html").is_file()
 
 
 def test_parts_that_overlap_at_home_are_named_with_their_depth(
@@ -102,20 +84,7 @@ def test_parts_that_overlap_at_home_are_named_with_their_depth(
 @pytest.mark.slow
 def test_the_page_of_an_arm_has_pictures_and_episodes(own: Path, tmp_path: Path, capsys):
     out = tmp_path / "out"
-    assert (
-        main(
-            [
-                "--quiet",
-                "robot",
-                "check",
-                str(own),
-                "--tasks=reach",
-                "--episodes=2",
-                f"--output_dir={out}",
-            ]
-        )
-        == 0
-    )
+    assert run(f"--quiet robot check {own} --tasks=reach --episodes=2 --output_dir={out}") == 0
     assert "| 50 of 50 | 100" in capsys.readouterr().out.replace("  ", " ")
-    assert "The arm at home in its scene" in (out / "check.html").read_text()
+    assert "The arm at home in its scene" in (out / "report.html").read_text()
     assert json.loads((out / "check.json").read_text())["tasks"][0]["clean"]["success_rate"] == 1

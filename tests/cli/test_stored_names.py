@@ -26,7 +26,7 @@ from manip_il.errors import ManipError
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from ..damage import digests
-from .made_runs import make_policy
+from .made_runs import make_policy, run
 
 ENV = make_config("panda", "pick_place", 2, object="box:0.04")  # an episode has few steps
 HERE = "here"  # the current folder, all of which must stay closed
@@ -102,7 +102,7 @@ def evaluate(base: Path) -> None:
 
 
 def replay(base: Path) -> None:
-    main(["eval", str(base / "e"), "--replay=4000000"])
+    run(f"eval {base / 'e'} --replay=4000000")
 
 
 FILES: dict[str, tuple[Callable[[Path], None], ...]] = {  # a file of metadata, and what uses it

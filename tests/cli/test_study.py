@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.imitation import DaggerOptions
-from manip_il.cli.main import main
 from manip_il.cli.run.imitation import read_plan
 from manip_il.errors import MismatchError
 
-from .made_runs import make_run
+from .made_runs import make_run, run
 
 FILE = """
 common:
@@ -53,7 +52,7 @@ def runs(policy, monkeypatch) -> list[DaggerOptions]:
 
 
 def study(*words: str) -> int:
-    return main(["compare", "x.yaml", "--output_dir=s", "--workers=1", *words])
+    return run("compare x.yaml --output_dir=s --workers=1", *words)
 
 
 def test_every_arm_runs_with_every_training_seed_and_its_own_options(here, runs):

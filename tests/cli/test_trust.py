@@ -15,7 +15,7 @@ from manip_il.cli.main import load, main
 from manip_il.cli.parsing import dump_yaml, options_of, parse
 from manip_il.cli.run.imitation import dagger_config, read_plan
 from manip_il.errors import ManipError, UsageError
-from manip_il.learn.checkpoint import find_policy, with_folder
+from manip_il.learn.checkpoint import find_policy
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options
 
@@ -62,8 +62,8 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(
     words = ["--env.horizon=8", "--workers=1", out]
     for command in (
         ["eval", f"--policy.path={hostile}", "--eval.n_episodes=1", *words],
-        ["compare", str(policy), str(hostile), "--eval.n_episodes=1", *words],
-        ["eval", str(file), "--replay=4000000", f"--policy.path={hostile}"],
+        [*f"compare {policy} {hostile} --eval.n_episodes=1".split(), *words],
+        f"eval {file} --replay=4000000 --policy.path={hostile}".split(),
         ["dagger", f"--policy.path={named}", out],
         ["dagger", "--policy.type=gaussian_actor", "--policy.vision_encoder_name=evil/x", out],
     ):
@@ -128,11 +128,7 @@ def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, 
     run = make_run(here / "run", policy)
     task = ["--task.type=reach"] if command == "dagger" else []
     options = parse(load(command), [*REQUIRED.get(command, []), *task, "--policy.path=run"])
-    fit = (
-        dagger_config(options).fit
-        if command == "dagger"
-        else FitConfig(with_folder(options.fit["policy"]))
-    )
+    fit = dagger_config(options).fit if command == "dagger" else FitConfig(options.fit["policy"])
     assert (
         Path(lerobot_options(fit)[0].policy.pretrained_path).resolve() == find_policy(run).resolve()
     )

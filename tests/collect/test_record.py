@@ -12,15 +12,11 @@ import pytest
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import collect, collect_successes, journal_of
 from manip_il.collect.workers import Engine
-from manip_il.data.build import Recording, build
-from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal, list_episodes, list_seeds
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.table import make_config
-
-from ..damage import digests
 
 JOB = RolloutJob(make_config("fetch", "reach", horizon=30), hold=1)
 SEEDS = range(1_000_000, 1_000_012)
@@ -107,18 +103,3 @@ def test_journals_of_another_environment_are_not_gone_on_with(tmp_path):
         )
         == 1
     )
-
-
-def test_a_dataset_recorded_as_it_goes_is_the_one_built_later(tmp_path):
-    failing = [SEEDS[1]]
-    folder = tmp_path / "journals"
-    rule = Recording(only_successes=True, episodes=3, provenance={"driver": "expert"})
-    episodes = collect_successes(Recorded(failing), JOB, SEEDS, 3, folder)
-    rule.write(folder)
-    info, failed = rule.make(episodes, tmp_path / "dataset")
-    assert (info.episodes, failed) == (3, 1)
-    seeds = Dataset.open(tmp_path / "dataset").columns(["seed"])["seed"]
-    assert sorted(set(seeds.tolist())) == [SEEDS[0], SEEDS[2], SEEDS[3]]
-    again, failed = build(folder, tmp_path / "again")
-    assert (again.episodes, failed) == (3, 1)
-    assert digests(tmp_path / "again") == digests(tmp_path / "dataset")

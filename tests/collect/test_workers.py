@@ -3,7 +3,6 @@ on a Ray cluster.
 """
 
 import contextlib
-import errno
 import logging
 import os
 import signal
@@ -49,15 +48,6 @@ def expected(tmp_path_factory) -> dict[str, bytes]:
     folder = tmp_path_factory.mktemp("here")
     assert len(list(Engine().run(JOB, SEEDS, journal_of(folder, JOB)))) == len(SEEDS)
     return contents(folder)
-
-
-def test_a_machine_without_shared_memory_is_named(monkeypatch):
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.EROFS, "Read-only file system")
-
-    monkeypatch.setattr("manip_il.collect.workers.ProcessPoolExecutor", refuse)
-    with pytest.raises(ManipError, match="cannot write /dev/shm: Read-only"), Engine(2) as engine:
-        list(engine.run(JOB, SEEDS))
 
 
 @pytest.fixture(scope="module")

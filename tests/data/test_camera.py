@@ -18,50 +18,11 @@ from manip_il.data.video_config import VideoConfig
 from manip_il.mdp import Episode
 
 from ..pictures import numbered_episodes, write
+from .test_other_peoples import NAMES, SIZE, record
 
 pytestmark = pytest.mark.slow
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 RECORDED = ("video", "image")
-SIZE = (64, 96, 3)
-
-
-def record(root: Path, kind: str, episodes: int) -> None:
-    """Episodes of numbers, text and two cameras by LeRobot's own writer. kind: of these, `video`
-    or `image`.
-    """
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    table: dict[str, Any] = {
-        "observation.state": {"dtype": "float32", "shape": (3,), "names": ["a", "b", "c"]},
-        "action": {"dtype": "float32", "shape": (2,), "names": {"motors": ["x", "y"]}},
-        "note": {"dtype": "string", "shape": (1,), "names": None},
-        "flag": {"dtype": "bool", "shape": (1,), "names": None},
-        **{
-            one: {"dtype": kind, "shape": SIZE, "names": ["height", "width", "channels"]}
-            for one in (FRONT, WRIST)
-        },
-    }
-    dataset: Any = LeRobotDataset.create(
-        "a/b", 10, table, root=root, robot_type="so100", use_videos=kind == "video"
-    )
-    rng = np.random.default_rng(0)
-    for episode in range(episodes):
-        for t in range(15 + episode):
-            row: dict[str, Any] = {
-                "task": f"task {episode % 2}",
-                "note": f"frame {t}",
-                "flag": np.array([t % 2 == 0]),
-            }
-            row |= {
-                key: rng.normal(size=table[key]["shape"]).astype(np.float32)
-                for key in list(table)[:2]
-            }
-            for camera in (FRONT, WRIST):
-                row[camera] = np.zeros(SIZE, np.uint8)
-                row[camera][:, 5 * t % 80 : 5 * t % 80 + 10, episode % 3] = 255
-            dataset.add_frame(row)
-        dataset.save_episode()
-    dataset.finalize()
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +43,8 @@ def roots(
         write(five, folder / codec, two, video=VideoConfig(codec), size=0.001)
     os.environ.setdefault("SVT_LOG", "1")  # or the encoder tells its life
     for kind in RECORDED:
-        record(folder / kind, kind, 3)
+        camera = {"dtype": kind, "shape": (*SIZE, 3), "names": NAMES}
+        record(folder / kind, ["fold"] * 3, **{FRONT: camera, WRIST: camera})
     pair = [folder / "video", folder / "video"]
     aggregate_datasets(["a/one", "a/two"], "a/all", roots=pair, aggr_root=folder / "aggregated")
     return {path.name: path for path in folder.iterdir()}
@@ -98,8 +60,8 @@ def test_what_is_decoded_at_once_or_when_it_is_read_is_bit_equal_to_what_lerobot
     twice = decode([cameras[FRONT]] * 2)
     np.testing.assert_array_equal(twice, np.concatenate([frames[FRONT]] * 2))
     plain: Any = LeRobotDataset("a/b", root=root)
-    assert list(frames) == [FRONT, WRIST]
-    assert sum(counts) == 2 * len(plain) == 2 * len(frames[FRONT]) > 40
+    assert {*frames} >= {FRONT, WRIST}
+    assert sum(counts) == len(frames) * len(plain) == len(frames) * len(frames[FRONT]) > 40
     rows = np.random.default_rng(0).integers(0, len(plain), 12)
     for key, values in frames.items():
         seen = cameras[key].rows(rows).transpose(0, 3, 1, 2)

@@ -1,7 +1,5 @@
 """One file an episode: whole and bit for bit, or refused by name."""
 
-import io
-import json
 import os
 import signal
 import subprocess
@@ -11,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_protobuf.decoder import DecoderFactory
 
 from manip_il.data import journal
 from manip_il.data import schema as s
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
+from ..mcap.use import decoded
 from ..pictures import numbered_episodes, with_cameras
 from ..synthetic import MakeEpisode
 
@@ -77,21 +74,12 @@ def test_a_file_cut_short_is_refused_by_name(path):
         journal.read_journal(path)
 
 
-def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
-    """Topic -> log times and decoded messages."""
-    found: dict[str, list[tuple[int, Any]]] = {}
-    reader = make_reader(
-        io.BytesIO(path.read_bytes()), validate_crcs=True, decoder_factories=[DecoderFactory()]
-    )
-    for schema, channel, message in reader.iter_messages():
-        decoder = DecoderFactory().decoder_for(channel.message_encoding, schema) or json.loads
-        found.setdefault(channel.topic, []).append((message.log_time, decoder(message.data)))
-    return found
-
-
 def test_foxglove_sees_joints_and_scalars(tmp_path, make_episode, spec):
     episode = make_episode(8, 3)
-    topics = messages(journal.Journal(tmp_path, spec, {}).write(episode))
+    topics: dict[str, list[tuple[int, Any]]] = {}
+    path = journal.Journal(tmp_path, spec, {}).write(episode)
+    for topic, time, message in decoded(path.read_bytes()):
+        topics.setdefault(topic, []).append((time, message))
     assert sorted(topics) == ["/action", "/executed_action", "/joint_states", "/scalars"]
     assert [time for time, _ in topics["/scalars"]] == [0, 50_000_000, 100_000_000]
     _, last = topics["/joint_states"][2]

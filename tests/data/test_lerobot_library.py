@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from manip_il.bridges.doctor.examine import examine_folder, has_errors
+from manip_il.bridges.doctor.examine import examine_folder
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
@@ -208,7 +208,7 @@ def assert_holds(root: Path, episodes: list[Episode]) -> None:
     """
     assert_comes_back(root, episodes)
     assert all(count_frames(path) == rows for path, rows in video_rows(root).items())
-    assert not has_errors(examine_folder(root))
+    assert not [one for one in examine_folder(root) if one.is_error]
     assert_loads(root, episodes)
 
 

@@ -304,7 +304,7 @@ def test_merged_datasets_of_others_are_for_lerobot_those_of_their_frames(annotat
     assert json.loads((tmp_path / "both" / layout.INFO).read_text())["features"] == features
 
 
-def test_chosen_episodes_are_taken_with_their_part_of_the_films(annotated, tmp_path):
+def test_chosen_episodes_are_taken_with_their_films(annotated, tmp_path):
     words = [
         "data",
         "merge",

@@ -37,14 +37,6 @@ def test_it_holds_ten_successful_episodes_of_pick_place():
     assert not table["actor"].any()  # the expert drove
 
 
-def test_lerobots_loader_reads_it():
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    dataset = LeRobotDataset("local/sample", root=SAMPLE)
-    assert (len(dataset), dataset.num_episodes) == (375, 10)
-    assert dataset.hf_dataset[0]["action"].shape == (8,)
-
-
 @pytest.mark.slow
 def test_it_can_be_recorded_again(tmp_path):
     again = tmp_path / "sample"

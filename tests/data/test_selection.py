@@ -74,6 +74,7 @@ def test_parts_are_the_rollout_cut_behind_every_done(rollout):
         ({"only_labelled": True, "labels": 7}, [3, 3, 1]),
         ({"only_labelled": True, "labels": 6}, [3, 3]),
         ({"only_successes": True}, [3, 3]),
+        ({"only_successes": True, "episodes": 1}, [3]),
     ],
 )
 def test_a_dataset_has_what_the_recording_says_and_is_built_again_to_the_byte(

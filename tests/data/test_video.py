@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from manip_il.bridges.doctor.examine import examine_folder, has_errors
+from manip_il.bridges.doctor.examine import examine_folder
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
-from manip_il.data.video import try_encoder
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import UnknownName
+from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.checkpoint import Origin
 from manip_il.mdp import Episode
 
@@ -85,7 +84,7 @@ def test_a_rate_that_is_not_whole_is_that_of_rows_videos_and_policies(filmed, tw
     theirs: Any = LeRobotDataset("local/lift", root=root)
     pictures = np.stack([255 * theirs[row][FRONT].numpy().transpose(1, 2, 0) for row in range(21)])
     assert numbers_of(pictures) == list(range(21))
-    assert not has_errors(examine_folder(root))
+    assert not [one for one in examine_folder(root) if one.is_error]
     (root / layout.OURS).unlink()
     assert Origin.of(Dataset.open(root).spec).fps == fps
 
@@ -117,8 +116,14 @@ def test_statistics_of_pictures_are_those_of_every_pixel(root, filmed):
         np.testing.assert_allclose(np.ravel(stats[name]), values, rtol=1e-10, err_msg=name)
 
 
-def test_an_encoder_makes_no_thread_a_real_time_one():
-    try_encoder(VideoConfig(vcodec="libsvtav1"), (64, 64), 10)
+def test_settings_that_an_encoder_refuses_are_one_line(filmed, two, tmp_path):
+    with pytest.raises(UsageError, match=r"cannot encode 96 x 72 pictures .*expected even"):
+        write(filmed, tmp_path / "odd", two, video=VideoConfig(preset="slowest"))
+    assert not (tmp_path / "odd").exists()
+
+
+def test_an_encoder_makes_no_thread_a_real_time_one(filmed, two, tmp_path):
+    write(filmed, tmp_path / "lift", two, video=VideoConfig(vcodec="libsvtav1"))
     assert {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")} == {
         os.SCHED_OTHER
     }
@@ -127,7 +132,7 @@ def test_an_encoder_makes_no_thread_a_real_time_one():
 def test_datasets_with_cameras_become_one_with_the_same_pictures(tmp_path, root):
     info = merge_datasets([root, root], tmp_path / "merged", provenance={"made": "here"})
     assert (info.episodes, info.frames) == (6, 42)
-    assert not has_errors(examine_folder(tmp_path / "merged"))
+    assert not [one for one in examine_folder(tmp_path / "merged") if one.is_error]
     assert Dataset.open(tmp_path / "merged").spec == Dataset.open(root).spec
     assert Dataset.open(tmp_path / "merged").provenance["made"] == "here"
     for camera in (FRONT, WRIST):

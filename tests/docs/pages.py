@@ -15,7 +15,6 @@ PAGES = (
     "benchmarks/README.md",
     "datasets/README.md",
 )
-LANGUAGES = ("sh", "python", "yaml", "toml", "text")
 _FENCE = re.compile(r"^ *```(\w*)$")
 
 

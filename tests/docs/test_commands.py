@@ -10,10 +10,10 @@ import pytest
 from ..store.servers import TOKEN, Hub, hub_server, s3_server
 from ..warm import Warm
 from .ours import Ours
-from .pages import LANGUAGES, PAGES, ROOT, Line, blocks, help_lines, page_lines
+from .pages import PAGES, ROOT, Line, blocks, help_lines, page_lines
 from .sizes import shrink_study
 from .stock import Stock
-from .workplace import PROGRAM, RULES, LeRobot, Workplace
+from .workplace import PROGRAM, LeRobot, Workplace
 
 BUCKET = "robots"  # the one in the docs
 _DRAWS = (
@@ -124,15 +124,3 @@ def _only_in_help() -> list[Line]:
 def test_the_example_in_the_help_runs(line: Line, workplace: Workplace):
     assert line.words[0] == PROGRAM
     workplace.run(line)
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_every_block_of_a_page_is_of_a_kind_that_the_tests_know(page: str):
-    for block in blocks(page):
-        assert block.language in LANGUAGES, block.where
-        if block.language == "text":
-            first_words = {line.split()[0] for line in block.text.splitlines() if line.split()}
-            assert not first_words & {
-                PROGRAM,
-                *RULES,
-            }, f"{block.where}: commands belong into a block of `sh`"

@@ -5,7 +5,6 @@ import os
 import re
 import shlex
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -44,8 +43,8 @@ class Workplace:
                 self._python_block(block)
             case "yaml":
                 self._yaml_block(block)
-            case _:
-                pass
+            case language:
+                assert language in ("text", "toml"), f"{block.where}: the tests know no {language}"
 
     def run(self, line: Line) -> None:
         """One command, at a small size; fails unless it ends with exit code 0."""
@@ -106,16 +105,6 @@ class Workplace:
 
         What is asked of the program in the container must be words it knows.
         """
-        if line.words[1] == "build":
-            arguments = [
-                word.partition("=")[0] for word in line.words if re.fullmatch(r"[A-Z_]+=\w+", word)
-            ]
-            assert all(
-                f"ARG {name}=" in (ROOT / "Dockerfile").read_text(encoding="utf-8")
-                for name in arguments
-            )
-            return
-        assert line.words[1] == "run", f"{line}: neither build nor run"
         _, _, asked = shlex.join(line.words).partition(f" {PROGRAM}")
         if asked.strip():
             name, own = command_of(tuple(shlex.split(asked)))
@@ -127,27 +116,8 @@ class Workplace:
     def _mkdir(self, line: Line) -> None:
         subprocess.run(line.words, cwd=self.folder, check=True)
 
-    def _export(self, line: Line) -> None:
-        """The tests' own servers have set them."""
-        names = [word.partition("=")[0] for word in line.words[1:]]
-        assert all(name in os.environ for name in names), (
-            f"{line}: no server of the tests reads these"
-        )
-
-    def _activate(self, line: Line) -> None:
-        assert line.words == (".", ".venv/bin/activate")
-        assert (Path(sys.prefix) / "bin" / "activate").is_file()
-
-    def _apt_get(self, line: Line) -> None:
-        """The packages are those with which CI starts from a bare Debian, and those that `make`
-        brings.
-        """
-        assert line.words[1:3] == ("install", "-y")
-        text = "".join(
-            (ROOT / ".ci" / name).read_text(encoding="utf-8") for name in ("fresh", "system")
-        )
-        missing = set(line.words[3:]) - set(re.findall(r"[\w.-]+", text))
-        assert not missing, f"{line}: CI does without {missing}"
+    def _not_run(self, line: Line) -> None:
+        """CI, or the tests' own servers, have done it."""
 
 
 RULES: dict[str, Callable[[Workplace, Line], None]] = {
@@ -155,9 +125,7 @@ RULES: dict[str, Callable[[Workplace, Line], None]] = {
     "docker": Workplace._docker,
     "python": Workplace._python,
     "mkdir": Workplace._mkdir,
-    "export": Workplace._export,
-    ".": Workplace._activate,
-    "apt-get": Workplace._apt_get,
+    **dict.fromkeys(("export", ".", "apt-get"), Workplace._not_run),
 }
 
 

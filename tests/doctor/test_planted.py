@@ -1,4 +1,4 @@
-"""Sixteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found,
+"""Fifteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found,
 and nothing else.
 """
 
@@ -132,15 +132,9 @@ def statistics(root: Path, rng: Rng) -> str:
 
 
 def died(root: Path, rng: Rng) -> str:
-    name = str(
-        rng.choice([DATA, EPISODES, "images/x/frame.png", "tmpab12cd_9/x.mp4", "meta/.x.partial"])
-    )
-    if (root / name).exists():
-        cut(root / name, float(rng.uniform(0.3, 0.95)))
-        return f"{name}: "
-    (root / name).parent.mkdir(parents=True, exist_ok=True)
-    (root / name).write_bytes(b"x")
-    return "left by a recorder, writer or download that died"
+    name = str(rng.choice([DATA, EPISODES]))
+    cut(root / name, float(rng.uniform(0.3, 0.95)))
+    return f"{name}: "
 
 
 def tasks(root: Path, rng: Rng) -> str:
@@ -149,13 +143,6 @@ def tasks(root: Path, rng: Rng) -> str:
         return "data: task_index: 3 at 9; expected 0"
     edit_table(root / EPISODES, lambda table: table["tasks"].__setitem__(0, ["Drop it"]))
     return "meta/episodes: tasks: .*Drop it"
-
-
-def own(root: Path, rng: Rng) -> str | None:
-    if not (root / layout.OURS).exists():
-        return None
-    edit_json(root / layout.OURS, lambda ours: ours["spec"]["joint_names"].__setitem__(0, "other"))
-    return "meta/manip_il.json: .*, but meta/info.json has"
 
 
 def idle(root: Path, rng: Rng) -> str:
@@ -241,7 +228,7 @@ def wraps(root: Path, rng: Rng) -> str:
 
 
 PLANTS: tuple[Plant, ...] = (
-    *(counts, rows, names, frames, finite, times, statistics, died, tasks, own),
+    *(counts, rows, names, frames, finite, times, statistics, died, tasks),
     *(idle, lag, cameras, joint, commands, wraps),
 )
 

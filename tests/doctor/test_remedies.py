@@ -1,4 +1,4 @@
-"""What a finding says to do helps: repair from journals or from the data, or LeRobot's tool."""
+"""What a finding says to do helps: repair, or LeRobot's tool."""
 
 import json
 import shlex
@@ -13,10 +13,9 @@ from manip_il.bridges.doctor.examine import examine_folder, repair
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
-from manip_il.data.journal import list_episodes
 from manip_il.errors import ManipError
 
-from ..damage import DATA, cut, digests, edit_json, edit_table, lines
+from ..damage import DATA, edit_json, edit_table, lines
 from ..warm import Warm
 from .teaching import make
 
@@ -33,7 +32,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def ours(made: Path, tmp_path: Path) -> Path:
-    """One with cameras, beside its journals."""
+    """One with cameras."""
     return shutil.copytree(made, tmp_path / "copy") / "ours"
 
 
@@ -44,40 +43,16 @@ def theirs(made: Path, tmp_path: Path) -> Path:
 
 
 def mend(root: Path) -> list[str]:
-    return list(repair(root, examine_folder(root)))
+    return list(repair(root))
 
 
-def test_a_damaged_dataset_is_rebuilt_from_its_journals_and_kept(ours):
-    whole = digests(ours)
-    cut(ours / DATA, 0.5)
-    damaged = digests(ours)
-    kept = ours.with_name("ours.before-repair")
-    assert mend(ours) == [
-        "rebuilt from ours.journals: 12 episodes",
-        f"replaced and moved files are kept in {kept}",
-    ]
-    assert (digests(ours), digests(kept)) == (whole, damaged)
-
-
-def test_journals_that_hold_less_than_the_dataset_replace_nothing(ours):
-    list_episodes(ours.with_name("ours.journals"))[0].unlink()
-    (ours / layout.TASKS).unlink()
-    before = digests(ours)
-    assert (
-        mend(ours)[0] == "not rebuilt: ours.journals holds 11 episodes, but 12 are still readable"
-    )
-    assert digests(ours) == before
-
-
-def test_counts_statistics_and_leftovers_are_mended_without_journals(theirs):
+def test_counts_and_statistics_are_mended_and_the_old_ones_kept(theirs):
     whole = json.loads((theirs / layout.STATS).read_text())
     edit_json(theirs / layout.INFO, lambda info: info.update(total_frames=3, total_episodes=1))
     edit_json(
         theirs / layout.STATS,
         lambda stats: (stats.pop(FRONT), stats[s.ACTION].update(mean=[9] * 5)),
     )
-    (theirs / "images").mkdir(exist_ok=True)
-    (theirs / "images/left.png").write_bytes(b"x")
     mend(theirs)
     assert examine_folder(theirs) == []
     stats = json.loads((theirs / layout.STATS).read_text())
@@ -86,7 +61,7 @@ def test_counts_statistics_and_leftovers_are_mended_without_journals(theirs):
     )
     np.testing.assert_allclose(stats[FRONT]["mean"], whole[FRONT]["mean"], atol=0.05)
     kept = theirs.with_name("theirs.before-repair")
-    assert sorted(path.name for path in kept.iterdir()) == ["images", "info.json", "stats.json"]
+    assert sorted(path.name for path in kept.iterdir()) == ["info.json", "stats.json"]
 
 
 def shift(root: Path, mean: float) -> dict[str, list[float]]:

@@ -5,7 +5,6 @@ narrow windows.
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import pytest
 from playwright.sync_api import Browser
@@ -50,16 +49,14 @@ def report(request: pytest.FixtureRequest) -> Report:
 
 @pytest.fixture(scope="module")
 def file(report: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("report") / "report.html"
-    report.write(path)
-    return path
+    return report.write(tmp_path_factory.mktemp("report"))
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
+@pytest.mark.parametrize("width", [1280, 390])
 def test_it_opens_quietly_and_fits_the_window(
-    browser: Browser, report: Report, file: Path, width: int, scheme: Literal["light", "dark"]
+    browser: Browser, report: Report, file: Path, width: int
 ):
-    with opened(browser, file, width, scheme) as window:
+    with opened(browser, file, width) as window:
         window.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
         wide, room = window.evaluate(
             "[document.documentElement.scrollWidth, document.documentElement.clientWidth]"
@@ -67,21 +64,7 @@ def test_it_opens_quietly_and_fits_the_window(
         assert wide <= room == width
         assert too_wide(window) == []
         assert first_words(window) == report.verdict
-        paper, ink = window.evaluate(
-            "(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))"
-        )
-        assert (brightness(paper) > brightness(ink)) == (scheme == "light")
         assert (window.console, window.requests) == ([], [])
-
-
-def test_the_page_runs_no_script_of_its_own_and_lets_none_in(browser: Browser, tmp_path: Path):
-    html = made_report().render()
-    slipped_in = html.replace("</main>", "<script>document.title = 'slipped in'</script></main>")
-    assert slipped_in != html
-    (tmp_path / "report.html").write_text(slipped_in)
-    with opened(browser, tmp_path / "report.html", 1280) as window:
-        assert window.page.title() != "slipped in"
-        assert any("Content Security Policy" in line for line in window.console)
 
 
 def first_words(window: Opened) -> str:
@@ -104,8 +87,3 @@ def too_wide(window: Opened) -> list[str]:
                     && !one.closest('thead'))
                 .map(one => one.tagName + ': ' + one.textContent.slice(0, 60));
         }""")
-
-
-def brightness(colour: str) -> int:
-    """Of `rgb(1, 2, 3)`."""
-    return sum(int(part) for part in colour.removeprefix("rgb(").removesuffix(")").split(","))

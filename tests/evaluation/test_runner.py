@@ -1,5 +1,6 @@
 """An evaluation's outcomes belong to their seeds, and it stops where it says it does."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,9 +10,10 @@ from manip_il.collect.drivers import PolicyDriver, RandomDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.evaluation import runner
-from manip_il.evaluation.results import EpisodeResult
-from manip_il.evaluation.runner import evaluate
+from manip_il.evaluation.results import EpisodeResult, EvalResult
+from manip_il.evaluation.runner import measure
 from manip_il.evaluation.suites import suite_conditions
+from manip_il.progress import Progress
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL, turn_of
 from manip_il.worlds.table import env_spec, make_config
@@ -43,6 +45,10 @@ def mlp(tmp_path_factory):
         width=64,
         batch_size=64,
     )
+
+
+def evaluate(engine: Engine, job: RolloutJob, seeds: Sequence[int], name: str, **how) -> EvalResult:
+    return measure(engine, job, seeds, name, Progress(), **how)
 
 
 def job_of(policy, **changes) -> RolloutJob:
@@ -120,18 +126,12 @@ def test_until_width_stops_at_the_first_look_that_is_narrow_enough(coins):
     assert max(map(max, engine.asked)) == len(found.episodes) - 1  # nothing beyond it was run
 
 
-def test_what_is_done_is_not_run_again_and_changes_nothing(coins):
+def test_what_is_done_is_not_run_again_and_changes_nothing(coins, tmp_path):
     outcomes = [seed % 9 != 0 for seed in range(1_000)]
     for width in (None, 0.1):
         whole = evaluate(coins(outcomes), COIN, range(1_000), "coin", until_width=width)
-        engine = coins(outcomes)
-        done = {seed: result(seed, outcomes[seed]) for seed in range(0, 1_000, 3)}
-        finished: list[EpisodeResult] = []
-        resumed = evaluate(
-            engine, COIN, range(1_000), "coin", finished.append, done=done, until_width=width
-        )
+        engine, folder = coins(outcomes), tmp_path / str(width)
+        evaluate(coins(outcomes), COIN, range(0, 1_000, 3), "coin", folder=folder)
+        resumed = evaluate(engine, COIN, range(1_000), "coin", folder=folder, until_width=width)
         assert resumed == whole
-        assert not {one.seed for one in finished} & set(done)
-        assert sorted(one.seed for one in finished) == sorted(
-            seed for asked in engine.asked for seed in asked
-        )
+        assert not {seed for asked in engine.asked for seed in asked} & set(range(0, 1_000, 3))

@@ -1,6 +1,5 @@
 """One dataset is learnt in any action space, and what comes out is joint targets again."""
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +13,6 @@ from lerobot.policies.factory import make_policy, make_policy_config, make_pre_p
 from manip_il.data.dataset import Dataset, JoinedDatasets
 from manip_il.data.schema import ACTION, STATE
 from manip_il.errors import ManipError, MismatchError
-from manip_il.learn import action_spaces
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.export import export_onnx
@@ -23,7 +21,6 @@ from manip_il.learn.names import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TAR
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.train import Trainer
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.robot import LeRobotConfig
 from manip_il.robots.table import get_robot
 from manip_il.worlds.contract import TWO_ARMS, EnvironmentSpec
 
@@ -259,22 +256,3 @@ def test_lerobots_own_training_has_no_kinematics(table, sources):
         make_policy(make_policy_config("mlp", action_space=EE_DELTA), ds_meta=meta)
     policy: Any = make_policy(make_policy_config("mlp", action_space=JOINT_TARGET), ds_meta=meta)
     np.testing.assert_array_equal(policy.model.target_high, table[ACTION].max(0))
-
-
-def test_a_hand_moves_alike_whatever_units_its_joints_have(monkeypatch: pytest.MonkeyPatch):
-    panda = get_robot("panda")
-    names = tuple(f"{name}.pos" for name in panda.joint_names)
-    actions, states = moves("panda", 5)
-    plain = Conversion(EE_DELTA, "panda")
-    wanted = plain.encode(actions, states)
-    in_degrees = np.array([180 / np.pi] * len(panda.joints) + [1.0])
-    with monkeypatch.context() as patch:
-        patch.setattr(
-            action_spaces,
-            "get_robot",
-            lambda name: replace(panda, lerobot=LeRobotConfig("arm", names, (0.0, 1.0))),
-        )
-        found = plain.encode(actions * in_degrees, states * in_degrees)
-        back = plain.decode(found, states * in_degrees)
-    np.testing.assert_allclose(found, wanted, atol=1e-9)
-    np.testing.assert_allclose(back, plain.decode(wanted, states) * in_degrees, atol=1e-6)

@@ -19,12 +19,6 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def test_floats_are_lerobots(pictures: Tensor) -> None:
-    # as it decodes video
-    assert torch.equal(to_float(pictures), (pictures / 255.0).type(torch.float32))
-    assert to_float(pictures).dtype == torch.float32
-
-
 def test_the_same_draws_give_the_same_bytes(pictures: Tensor) -> None:
     augment = Augment()
     first, again, other = (augment(pictures, generator(seed)) for seed in (1, 1, 2))

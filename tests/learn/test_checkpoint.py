@@ -36,7 +36,12 @@ EVIL = {
 
 def test_what_a_policy_sees_gives_and_is_for_is_read_without_loading_it(pictured, tmp_path):
     origin = Origin.of(
-        pictured, {"mujoco": "3"}, {"steps": 2}, "both", {}, action_space="joint_target"
+        pictured,
+        {"mujoco": "3"},
+        {"steps": 2},
+        observation="both",
+        look={},
+        action_space="joint_target",
     )
     folder = write_checkpoint(tmp_path / "policy", "act", pictured, "both", origin=origin)
     (folder / "model.safetensors").write_bytes(b"")
@@ -51,12 +56,8 @@ def test_what_a_policy_sees_gives_and_is_for_is_read_without_loading_it(pictured
     assert found.pictures == {"front": (32, 48), "wrist": (32, 48)}
     assert found.origin == origin
     found.check_fits(pictured)
-    edit_config(
-        folder,
-        input_features={
-            "observation.images.empty_camera_0": {"type": "VISUAL", "shape": [3, 48, 64]}
-        },
-    )
+    placeholder = {"observation.images.empty_camera_0": {"type": "VISUAL", "shape": [3, 48, 64]}}
+    edit_config(folder, input_features=placeholder)
     assert Checkpoint.open(folder).pictures == {}  # LeRobot fills it in itself
 
 
@@ -83,15 +84,9 @@ def test_an_environment_that_lacks_an_input_is_refused_by_both_names(change, wor
         replace(Checkpoint.open(act), **change).check_fits(pictured)
 
 
-@pytest.mark.parametrize(
-    "change", [{"robot": "leg"}, {"fps": 50}, {"joint_names": ("a", "c", "b", "gripper")}]
-)
-def test_a_policy_for_something_else_is_refused_naming_both(change, act, spec):
-    with pytest.raises(MismatchError) as error:
-        Checkpoint.open(act).check_fits(replace(spec, **change))
-    ((name, value),) = change.items()
-    assert str(value) in str(error.value)
-    assert str(getattr(spec, name)) in str(error.value)
+def test_a_policy_for_something_else_is_refused_naming_both(act, spec):
+    with pytest.raises(MismatchError, match=r"fps differs: the policy has 25, .* has 50"):
+        Checkpoint.open(act).check_fits(replace(spec, fps=50))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@ training sees.
 """
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,10 +20,9 @@ from lerobot.policies.factory import (
 )
 
 from manip_il.data.schema import features
-from manip_il.errors import MismatchError, UnknownName, UsageError
+from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.cnn import CNNConfig, CNNPolicy, KeypointEncoder
-from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.lerobot_config import policy_config, policy_features
+from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.lerobot_policy import build_policy
 from manip_il.learn.losses import LOSSES
 
@@ -78,6 +78,12 @@ def make_batch(table, rows: int = 20, seed: int = 0) -> dict[str, torch.Tensor]:
     for camera in ("front", "wrist"):
         batch[f"observation.images.{camera}"] = torch.rand(rows, 3, SIDE, SIDE, generator=generator)
     return batch | {"index": torch.arange(rows)}
+
+
+def saved_and_loaded(policy: CNNPolicy, folder: Path, **changes: Any) -> CNNPolicy:
+    policy.save_pretrained(folder)
+    edit_config(folder, **changes)
+    return CNNPolicy.from_pretrained(folder, strict=True).eval()
 
 
 def rows_of(batch: dict[str, torch.Tensor]) -> list[dict[str, torch.Tensor]]:
@@ -177,7 +183,6 @@ def test_a_row_does_not_depend_on_the_others_nor_on_half_precision(meta, table):
         )
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(policy.select_action(batch), together)
-    assert policy.select_action({key: value[:0] for key, value in batch.items()}).shape == (0, 4)
 
 
 def test_the_truth_is_read_off_joints_and_keypoints_and_learnt_while_training_only(meta, table):
@@ -212,11 +217,6 @@ def test_offsets_that_are_read_off_or_given_enter_at_several_scales_too(meta, ta
     truth = torch.from_numpy(table["observation.environment_state"])
     for observation, seen in (("images", 4 + 24), ("both", 4 + 6 + 24)):
         policy = new_policy(named, observation, scales=scales, width=64)
-        optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
-        for _ in range(20):
-            optimizer.zero_grad()
-            policy.forward(batch)[0].backward()
-            optimizer.step()
         given = policy.network_inputs(batch)[:, seen:].detach()
         around = truth[:20]
         if observation == "images":
@@ -224,12 +224,8 @@ def test_offsets_that_are_read_off_or_given_enter_at_several_scales_too(meta, ta
             around = read_off * truth.std(0, correction=0) + truth.mean(0)
         squashed = torch.cat([torch.tanh(around[:, [0, 3]] / scale) for scale in scales], dim=1)
         torch.testing.assert_close(given, squashed, rtol=1e-3, atol=1e-3)
-        policy.save_pretrained(tmp_path / observation)
-        again = CNNPolicy.from_pretrained(tmp_path / observation, strict=True)
-        assert torch.equal(again.eval().select_action(batch), policy.eval().select_action(batch))
-    for options in ({"scales": [0.003], "aux_weight": 0.0}, {"scales": [-1.0]}):
-        with pytest.raises(UsageError, match=r"policy\.scales (is|needs)"):
-            new_policy(named, **options)
+        again = saved_and_loaded(policy, tmp_path / observation)
+        assert torch.equal(again.select_action(batch), policy.eval().select_action(batch))
     with pytest.raises(UsageError, match="scales needs offsets"):
         new_policy(meta, scales=scales)
 
@@ -256,14 +252,7 @@ def test_with_states_actions_are_learnt_from_true_ones_with_noise_and_follow_the
         expected,
         policy.model.act(torch.cat([policy.network_inputs(row) for row in rows_of(batch)])),
     )
-    policy.save_pretrained(tmp_path)
-    assert torch.equal(
-        CNNPolicy.from_pretrained(tmp_path, strict=True).eval().select_action(batch), expected
-    )
-    with pytest.raises(UsageError, match=r"policy\.states needs"):
-        new_policy(meta, states=str(meta.root), aux_weight=0.0)
-    with pytest.raises(UsageError, match=r"policy\.states cannot be combined with ee_delta"):
-        new_policy(meta, states=str(meta.root), action_space="ee_delta")
+    assert torch.equal(saved_and_loaded(policy, tmp_path).select_action(batch), expected)
     config: Any = policy.config
     wide = write_table({**table, "action": 3 * table["action"]}, tmp_path / "wide", spec)
     config.pretrained_path, config.states = tmp_path, str(wide[0].root)
@@ -280,9 +269,6 @@ def test_with_states_actions_are_learnt_from_true_ones_with_noise_and_follow_the
 
 def test_a_checkpoint_that_learnt_heat_maps_acts_with_all_of_its_keypoints(meta, table, tmp_path):
     policy, batch = new_policy(meta, keypoints=5), make_batch(table)
-    policy.save_pretrained(tmp_path)
-    edit_config(tmp_path, keypoints=3, named_points=2, heatmap_weight=0.1)
-    again = CNNPolicy.from_pretrained(tmp_path, strict=True)
-    assert torch.equal(again.eval().select_action(batch), policy.eval().select_action(batch))
-    with pytest.raises(UnknownName, match="heatmap_weight"):
-        policy_config(FitConfig({"type": "cnn", "heatmap_weight": 0.1}))
+    old = {"keypoints": 3, "named_points": 2, "heatmap_weight": 0.1}
+    again = saved_and_loaded(policy, tmp_path, **old)
+    assert torch.equal(again.select_action(batch), policy.eval().select_action(batch))

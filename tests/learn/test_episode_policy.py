@@ -8,8 +8,6 @@ import pytest
 import torch
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
-from manip_il.errors import MismatchError
-from manip_il.learn.checkpoint import Origin
 from manip_il.learn.policy import LearnedPolicy
 
 from .tiny_policies import observations, write_checkpoint
@@ -118,23 +116,3 @@ def test_the_task_in_words_reaches_the_policy(act, monkeypatch):
     policy.begin({1: "no, here"})
     policy.act(*observations(2, 0))
     assert tasks[STEPS:] == [["put it there"], ["no, here"]]
-
-
-def test_pictures_must_be_those_of_the_checkpoint(pictured, tmp_path):
-    origin = Origin.of(pictured, observation="images", look={})
-    policy = LearnedPolicy.load(
-        write_checkpoint(tmp_path / "policy", "act", pictured, "images", origin=origin)
-    )
-    assert policy.checkpoint.observation == "images"
-    assert (policy.cameras, policy.checkpoint.origin) == (("front", "wrist"), origin)
-    states, environments = (column[:2] for column in observations(STEPS, 0))
-    picture = np.zeros((2, 32, 48, 3), np.uint8)
-    dark = policy.act(states, environments, {"front": picture, "wrist": picture}, [0, 1])
-    policy.begin({0: "", 1: ""})
-    assert not np.array_equal(
-        policy.act(states, environments, {"front": picture + 255, "wrist": picture}, [0, 1]), dark
-    )
-    with pytest.raises(MismatchError, match=r"pictures of wrist.*\(32, 48\).*\(48, 32\)"):
-        policy.act(states, environments, {"front": picture, "wrist": picture.transpose(0, 2, 1, 3)})
-    with pytest.raises(MismatchError, match=r"pictures of wrist"):
-        policy.act(states, environments, {"front": picture})

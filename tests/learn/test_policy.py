@@ -98,8 +98,9 @@ def test_pictures_go_in_as_lerobot_feeds_them():
     assert all(torch.equal(inner.batch[key], theirs[key]) for key in theirs)
     assert inner.batch["observation.images.front"].is_contiguous()
     assert inner.episodes == [40, 30]
-    with pytest.raises(MismatchError, match="pictures of front"):
-        policy.act(states, environments, {"wrist": picture})
+    for wrong in ({"wrist": picture}, {"front": picture.transpose(0, 2, 1, 3)}):
+        with pytest.raises(MismatchError, match=r"pictures of front.*\(5, 6\)"):
+            policy.act(states, environments, wrong)
 
 
 def test_offsets_are_seen_at_several_scales_and_nothing_else_is(write, table, spec, tmp_path):
@@ -112,19 +113,13 @@ def test_offsets_are_seen_at_several_scales_and_nothing_else_is(write, table, sp
     ).fit()
     policy, states, environments = LearnedPolicy.load(path), *observations(70)
     network: Any = policy.module
-    assert (network.scaled, network.inputs, len(network.input_mean)) == ([5, 6], 10, 14)
+    assert network.scaled == [5, 6]
     raw = torch.from_numpy(np.concatenate([states, environments], axis=1))
     assert torch.equal(network.expanded(raw)[:, 12:], torch.tanh(raw[:, [5, 6]] / 0.03))
     actions = policy.act(states, environments)
     assert np.array_equal(policy.act(states[7:9], environments[7:9]), actions[7:9])
     assert np.array_equal(
         MLPPolicy.from_pretrained(path).model.act(raw).numpy().astype(np.float64), actions
-    )
-    again = Trainer(
-        data, FitConfig({"path": str(path)}, steps=1, lr=1e-12, batch_size=32), tmp_path / "again"
-    ).fit()
-    np.testing.assert_allclose(
-        LearnedPolicy.load(again).act(states, environments), actions, atol=2e-5
     )
     with pytest.raises(UsageError, match="scales needs offsets"):
         Trainer(write(table, "other"), FitConfig({"scales": [0.003]}), tmp_path / "other_run").fit()

@@ -2,21 +2,20 @@
 
 import json
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies.act.configuration_act import ACTConfig
-from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
 from manip_il.data.dataset import Dataset, JoinedDatasets
 from manip_il.learn.batches import to_float
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.samples import Windows, windows_of
+from manip_il.learn.samples import Windows
 from manip_il.learn.train import Trainer
 
 from .conftest import make_table, write_table
@@ -57,17 +56,6 @@ def test_samples_with_an_unsound_label_and_last_frames_are_left_out(
     assert Windows(EPISODES, deltas).usable(valid, drop_last).tolist() == usable
 
 
-def test_the_windows_are_those_that_the_policy_asks_for() -> None:
-    columns = ["observation.state", "action"]
-    act = windows_of(ACTConfig(chunk_size=4, n_action_steps=4, device="cpu"), columns, EPISODES)
-    assert {key: value.tolist() for key, value in act.deltas.items()} == {"action": [0, 1, 2, 3]}
-    diffusion = windows_of(
-        DiffusionConfig(n_obs_steps=2, horizon=8, device="cpu"), columns, EPISODES
-    )
-    assert diffusion.deltas["observation.state"].tolist() == [-1, 0]
-    assert diffusion.deltas["action"].tolist() == list(range(-1, 7))
-
-
 @pytest.mark.parametrize(
     ("settings", "observation"),
     [(ACT, "state"), (DIFFUSION, "state"), (ACT, "images"), (ACT, "both")],
@@ -80,18 +68,15 @@ def test_a_batch_is_that_of_lerobots_loader(
     config = FitConfig(
         {**settings, "pretrained_backbone_weights": None}, observation=observation, batch_size=8
     )
-    samples = Trainer(sources, config, tmp_path / "run").data
-    meta = JoinedDatasets(sources)
-    ahead = {
-        key: [delta / meta.fps for delta in deltas.tolist()]
-        for key, deltas in samples.windows.deltas.items()
-    }
-    lerobots: Any = LeRobotDataset(
-        meta.repo_id, root=sources[0].root, delta_timestamps=ahead or None
-    )
+    trainer = Trainer(sources, config, tmp_path / "run")
+    samples, meta = trainer.data, JoinedDatasets(sources)
+    ahead = resolve_delta_timestamps(trainer.pipeline.policy, cast(Any, meta))
+    lerobots: Any = LeRobotDataset(meta.repo_id, root=sources[0].root, delta_timestamps=ahead)
     for rows in (np.array([0, 3, 20, meta.total_frames - 1]), np.array([7])):
         theirs = torch.utils.data.default_collate([lerobots[int(row)] for row in rows])
-        for key, value in samples.batch(rows).items():
+        batch = samples.batch(rows)
+        assert {f"{key}_is_pad" for key in batch if key in (ahead or {})} <= batch.keys()
+        for key, value in batch.items():
             if key == "task":
                 assert list(value) == list(theirs[key])
                 continue

@@ -5,7 +5,6 @@ It refuses what it cannot learn from.
 
 import json
 import math
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,9 @@ import torch
 
 from manip_il.cli.main import main
 from manip_il.data.atomic import UNFINISHED_MARK, read_lines
-from manip_il.data.lerobot_layout import OURS
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.losses import LOSSES
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.sources import check_same_sources
 from manip_il.learn.train import Trainer
@@ -120,12 +117,9 @@ def test_two_steps_are_saved_resumed_and_act(
     assert policy.act(
         states, environments, {"front": np.zeros((2, 32, 48, 3), np.uint8)}
     ).shape == (2, 4)
-    assert [record["step"] for record in read_lines(tmp_path / "run" / METRICS_FILE)] == [
-        1,
-        2,
-        3,
-        4,
-    ]
+    records = read_lines(tmp_path / "run" / METRICS_FILE)
+    assert [record["step"] for record in records] == [1, 2, 3, 4]
+    assert {"grad_norm", "lr", "samples_per_s", "update_s"} <= records[0].keys()
 
 
 def test_the_seed_decides_and_metrics_and_checkpoints_change_nothing(fit, weights):
@@ -134,41 +128,6 @@ def test_the_seed_decides_and_metrics_and_checkpoints_change_nothing(fit, weight
     c = weights(fit({**DIFFUSION}, "c", seed=1))
     assert all(torch.equal(a[key], b[key]) for key in a)
     assert not all(torch.equal(a[key], c[key]) for key in a)
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_every_loss_learns_to_act(loss, table, write, fit):
-    data = write(table)
-    settings = {**MLP, "loss": loss, "components": 2, "width": 64}
-
-    def errors(path: Path) -> np.ndarray:
-        actions = LearnedPolicy.load(path).act(
-            table["observation.state"], table["observation.environment_state"]
-        )
-        return np.abs(actions - table["action"]).mean(0)
-
-    before = errors(fit(settings, "before", data, steps=1))
-    after = errors(
-        fit(settings, "after", data, steps=400, save_freq=400, log_freq=400, batch_size=64, lr=5e-3)
-    )
-    assert after[:-1].mean() < 0.6 * before[:-1].mean()
-    assert after[-1] < 0.01
-
-
-def test_a_chunk_policy_learns_and_says_how(fit, tmp_path):
-    plan = {**ACT, "use_vae": False, "chunk_size": 1, "n_action_steps": 1}
-    fit(plan, steps=90, batch_size=32, log_freq=30, save_freq=90, lr=3e-3)
-    first, _, last = read_lines(tmp_path / "run" / METRICS_FILE)
-    assert last["loss"] < 0.7 * first["loss"]
-    assert last["val_loss"] < first["val_loss"]
-    assert {
-        "grad_norm",
-        "lr",
-        "samples_per_s",
-        "update_s",
-        "l1_loss",
-        "val_l1_loss",
-    } <= first.keys()
 
 
 def test_held_out_episodes_are_never_learnt_from(dataset, tmp_path):
@@ -260,10 +219,6 @@ def test_a_policy_of_lerobots_starts_from_a_checkpoints_weights(fit, weights):
     (first / "model.safetensors").write_bytes(b"\x08" + bytes(7) + b"nothing}")
     with pytest.raises(ManipError, match=r"does not fit this policy"):
         fit({"path": str(first)}, "again")
-    mlp = fit(name="mlp")
-    (mlp / "model.safetensors").write_bytes(b"\xff" * 100)
-    with pytest.raises(ManipError, match=r"model\.safetensors cannot be read"):
-        fit(name="warm", init_from=mlp)
 
 
 def test_a_feature_that_never_moves_is_not_seen(table, fit):
@@ -318,32 +273,22 @@ def test_several_datasets_are_one_in_the_units_of_all_and_the_shares_asked_for(s
         drawn = np.concatenate([trainer.batch(step)["index"].numpy() for step in range(1000)])
         assert (drawn < 240).mean() == pytest.approx(0.75 if weights else 0.5, abs=0.02)
         assert trainer.fit().is_dir()
-    chunks = Trainer(roots, config(ACT, eval_split=0.0), tmp_path / "act")
-    assert chunks.data.batch(np.array([239]))["action_is_pad"][0].tolist() == [
-        False,
-        True,
-        True,
-        True,
-    ]
-    trainer = Trainer(
-        roots, config(), tmp_path / "few", weights=(np.arange(480) < 20).astype(float)
-    )
+    weights = (np.arange(480) < 20).astype(float)
+    trainer = Trainer(roots, config(), tmp_path / "few", weights=weights)
     assert max(int(trainer.batch(step)["index"].max()) for step in range(50)) < 20
 
 
-def test_datasets_that_mean_other_things_are_refused_with_both_named(spec, write, table):
-    one = write(table, "one")[0]
+def test_datasets_that_mean_other_things_are_refused_with_both_named(spec):
     for change, words in (
-        ({"robot": "leg"}, r"robot differs: .*one has arm, .*other has leg"),
-        ({"fps": 30}, r"fps differs: .*one has 25, .*other has 30"),
-        ({"task": "lift"}, r"task differs: .*one has reach, .*other has lift"),
+        ({"robot": "leg"}, r"robot differs: one has arm, other has leg"),
+        ({"fps": 30}, r"fps differs: one has 25, other has 30"),
+        ({"task": "lift"}, r"task differs: one has reach, other has lift"),
         ({"cameras": ("front",), "image_size": (32, 32), "video": False}, r"cameras differs"),
     ):
-        other = write(table, f"{next(iter(change))}/other", replace(spec, **change))[0]
-        both = (one.root, other.root), (one.spec, other.spec)
+        both = {"one": spec, "other": replace(spec, **change)}
         with pytest.raises(MismatchError, match=words):
-            check_same_sources(*both, pictures=True, language=False)
-    check_same_sources(*both, pictures=False, language=False)
+            check_same_sources(both, pictures=True, language=False)
+    check_same_sources(both, pictures=False, language=False)
 
 
 # `torchrun --standalone --nproc_per_node=2`, with processes that need not import torch again
@@ -384,94 +329,3 @@ def test_two_processes_learn_what_one_learns_from_both_shares(
         weights(run / "checkpoints/last/pretrained_model") for run in (tmp_path / "one", two)
     )
     assert all(torch.allclose(one[name], both[name], atol=1e-5) for name in one)
-
-
-def somebodys(root: Path) -> Path:
-    """A dataset that LeRobot's API made of a real arm: six joints, two cameras, a text."""
-    from lerobot.datasets import LeRobotDataset
-
-    joints = [f"{name}.pos" for name in ("pan", "lift", "elbow", "flex", "roll", "gripper")]
-    columns: dict[str, Any] = {
-        key: {"dtype": "float32", "shape": (6,), "names": joints}
-        for key in ("observation.state", "action")
-    }
-    size = {"dtype": "image", "shape": (32, 48, 3), "names": ["height", "width", "channels"]}
-    columns |= {f"observation.images.{camera}": size for camera in ("front", "wrist")}
-    made = LeRobotDataset.create(
-        "somebody/so101", 30, columns, root=root, robot_type="so_follower", use_videos=False
-    )
-    rng = np.random.default_rng(0)
-    for _ in range(3):
-        for _ in range(10):
-            state = rng.normal(size=6).astype(np.float32)
-            frame = {
-                "observation.state": state,
-                "action": 0.9 * state,
-                "task": "put the cube into the box",
-            }
-            pictures = rng.integers(256, size=(2, 32, 48, 3), dtype=np.uint8)
-            frame |= dict(zip((key for key in columns if "images" in key), pictures, strict=True))
-            made.add_frame(frame)
-        made.save_episode()
-    made.finalize()
-    return root
-
-
-def test_where_an_environment_fits_a_policy_the_next_command_evaluates_it(tmp_path, capsys):
-    sample = shutil.copytree(Path(__file__).parents[2] / "datasets/sample", tmp_path / "sample")
-    (sample / OURS).unlink()  # as LeRobot's tools do
-    assert (
-        main(["train", f"--dataset.root={sample}", "--steps=1", f"--output_dir={tmp_path / 'run'}"])
-        == 0
-    )
-    assert "next: manip-il eval --policy.path=" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_act_learns_from_somebodys_pictures_and_lerobot_train_goes_on(
-    warm_lerobot, tmp_path, capsys
-):
-    root, run = somebodys(tmp_path / "theirs"), tmp_path / "run"
-    words = [
-        "train",
-        f"--dataset.root={root}",
-        f"--output_dir={run}",
-        "--steps=4",
-        "--save_freq=2",
-        "--batch_size=4",
-    ]
-    words += [
-        f"--policy.{k}={json.dumps(v) if not isinstance(v, str) else v}" for k, v in VISION.items()
-    ]
-    assert main(words) == 1
-    assert (
-        "no observation.environment_state, which --observation=state needs"
-        in capsys.readouterr().err
-    )
-    assert main([*words, "--observation=images"]) == 0
-    assert (
-        "no simulator of this program fits the policy: joint_names differs"
-        in capsys.readouterr().out
-    )
-    policy = LearnedPolicy.load(
-        run / "checkpoints/last/pretrained_model", task="put the cube into the box"
-    )
-    assert policy.checkpoint.origin.robot == "so101"
-    pictures = {camera: np.zeros((1, 32, 48, 3), np.uint8) for camera in ("front", "wrist")}
-    assert policy.act(
-        np.zeros((1, 6), np.float32), np.empty((1, 0), np.float32), pictures
-    ).shape == (1, 6)
-    again = [
-        "dagger",
-        "--robot.type=so101",
-        "--cameras=front",
-        f"--dataset.root={root}",
-        f"--output_dir={tmp_path / 'd'}",
-    ]
-    assert main([*again, "--policy.type=act", "--observation=images"]) == 1
-    assert "has no sim_state, so rollouts cannot be added to it" in capsys.readouterr().err
-    config = run / "checkpoints/last/pretrained_model/train_config.json"
-    more = [f"--dataset.root={root}", f"--output_dir={run}", "--steps=6", "--num_workers=0"]
-    done = warm_lerobot.run("lerobot-train", f"--config_path={config}", "--resume=true", *more)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert (run / "checkpoints/last").resolve().name == "000006"

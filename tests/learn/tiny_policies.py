@@ -12,7 +12,7 @@ from lerobot.policies.factory import get_policy_class, make_policy_config, make_
 
 from manip_il.data.schema import ENVIRONMENT_STATE, STATE, features
 from manip_il.errors import ManipError
-from manip_il.learn.checkpoint import META_FILE, Origin
+from manip_il.learn.checkpoint import Origin
 from manip_il.learn.lerobot_config import policy_features, policy_types
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.worlds.contract import EnvironmentSpec
@@ -84,7 +84,7 @@ def write_checkpoint(
     for processor in make_pre_post_processors(config, dataset_stats=_statistics(config)):
         processor.save_pretrained(folder)
     if origin is not None:
-        (folder / META_FILE).write_text(json.dumps(origin.to_json()))
+        origin.write(folder)
     return folder
 
 

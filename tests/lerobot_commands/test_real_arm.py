@@ -16,7 +16,7 @@ from lerobot.rollout.inference.sync import SyncInferenceEngine
 from lerobot.utils.constants import OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
-from manip_il.bridges.doctor.examine import examine_folder, has_errors
+from manip_il.bridges.doctor.examine import examine_folder
 from manip_il.cli.main import main
 from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, STATE
@@ -93,7 +93,7 @@ def test_simulated_and_real_demonstrations_merge_and_train(
     ]
     command("lerobot-edit-dataset", "--new_repo_id=someone/both", f"--new_root={both}", *words)
 
-    assert not has_errors(examine_folder(both))
+    assert not [one for one in examine_folder(both) if one.is_error]
     info = json.loads((both / "meta/info.json").read_text())
     assert (info["robot_type"], info["fps"], info["total_episodes"]) == ("so_follower", 30, 4)
     merged, first = (

@@ -2,7 +2,7 @@
 well or badly.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,18 +54,6 @@ def write(root: Path, episodes: list[Episode], spec: s.EnvironmentSpec) -> None:
 def clips(datasets: Path) -> Clips:
     """Sixty pairs of clips of ten steps of both datasets."""
     return clips_of([datasets / "good", datasets / "bad"], 60)
-
-
-@pytest.fixture
-def error(capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
-    """Returns the one line of error since the last output was read."""
-
-    def line() -> str:
-        err = capsys.readouterr().err
-        [found] = [line for line in err.splitlines() if line.startswith("manip-il: error:")]
-        return found
-
-    return line
 
 
 def brought(episode: Episode, spec: s.EnvironmentSpec, well: bool) -> Episode:

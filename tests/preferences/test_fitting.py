@@ -30,14 +30,14 @@ def fitted(clips, answers):
 @pytest.fixture(scope="module")
 def folder(fitted, clips, tmp_path_factory):
     made = tmp_path_factory.mktemp("reward")
-    write_reward(made, fitted.network, clips.frames[0].spec, {"seed": 0}, {})
+    write_reward(made, fitted.network, clips.data.spec, {"seed": 0}, {})
     return made
 
 
 def test_a_reward_learns_what_its_answers_are_about(fitted, clips):
     with torch.no_grad():
-        reward = fitted.network(torch.from_numpy(clips.inputs)).numpy()
-    assert np.corrcoef(reward, clips.progress)[0, 1] > 0.75
+        reward = fitted.network(torch.from_numpy(clips.data.inputs)).numpy()
+    assert np.corrcoef(reward, clips.data.progress)[0, 1] > 0.75
     assert fitted.true.rate > 0.85
     assert np.quantile(reward, [0.01, 0.99]) == pytest.approx([0, 1], abs=0.02)
 
@@ -86,7 +86,7 @@ def test_ways_are_the_triples_that_lead_from_one_thing_to_another(spec):
 
 def test_a_reward_is_for_one_task_and_observation(folder, clips, datasets):
     reward = LearnedReward.load(folder)
-    reward.check_fits("here", clips.frames[0].spec)
+    reward.check_fits("here", clips.data.spec)
     with pytest.raises(
         MismatchError, match=r"task differs: the reward has lift, .*other has reach"
     ):

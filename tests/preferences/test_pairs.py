@@ -66,13 +66,6 @@ def test_a_run_stands_for_the_datasets_of_its_rounds(tmp_path, datasets):
     assert [path.parent.name for path in find_datasets([tmp_path])] == ["round_000", "round_001"]
 
 
-def test_pairs_are_the_same_from_their_file(clips, tmp_path):
-    path = tmp_path / "pairs.json"
-    path.write_text(json.dumps(clips.pairs.to_json()))
-    assert Pairs.read(path) == clips.pairs
-    assert (read_clips(Pairs.read(path), clips.roots).rows == clips.rows).all()
-
-
 def test_a_dataset_that_was_changed_since_is_refused(clips):
     tree = clips.pairs.to_json()
     tree["sources"][0]["sha256"] = "0" * 64
@@ -86,7 +79,7 @@ def test_no_path_in_a_file_of_pairs_is_opened(clips):
     tree = clips.pairs.to_json()
     for source in tree["sources"]:
         source["root"] = "nowhere"
-    assert (read_clips(Pairs.from_json(tree), clips.roots).inputs == clips.inputs).all()
+    assert (read_clips(Pairs.from_json(tree), clips.roots).data.inputs == clips.data.inputs).all()
 
 
 def test_answers_to_a_second_file_of_pairs_are_about_its_clips(datasets, tmp_path):
@@ -98,7 +91,7 @@ def test_answers_to_a_second_file_of_pairs_are_about_its_clips(datasets, tmp_pat
     assert [source.root for source in joined.sources] == list(map(str, roots))
     both = read_clips(joined, roots)
     alone = read_clips(files[1], roots)
-    assert (both.inputs[both.rows[12:]] == alone.inputs[alone.rows]).all()
+    assert (both.data.inputs[both.rows[12:]] == alone.data.inputs[alone.rows]).all()
     path = tmp_path / "preferences.json"
     path.write_text(json.dumps(Preferences(files[1].sha256, "Ada", (Answer(3, "left"),)).to_json()))
     assert [one.pair for one in Preferences.read(path, files).answers] == [15]

@@ -2,50 +2,24 @@
 of a known taste.
 """
 
-import itertools
-
 import numpy as np
 
 from manip_il.chapter.rewards.max_entropy import SoftPlan
-from manip_il.tasks.carry.grid import Demonstration, PathProblem, cheapest_path, plan
+from manip_il.tasks.carry.grid import Demonstration, PathProblem, plan
 
 
-def grid(
-    rng: np.random.Generator, shape: tuple[int, ...] = (6, 5), things: int = 2, step: float = 1.0
-) -> PathProblem:
+def grid(rng: np.random.Generator, shape: tuple[int, int] = (6, 5), things: int = 2) -> PathProblem:
     """A grid with neighbours in all directions: length, then what each of some things, at drawn
     places, adds near it.
 
     The goal is the last node.
     """
-    places = (
-        np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, len(shape))
-        * step
-    )
-    number = np.arange(len(places)).reshape(shape)
-    near = [
-        np.exp(
-            -0.5
-            * (np.linalg.norm(places - rng.uniform(0, step * (np.array(shape) - 1)), axis=1) / step)
-            ** 2
-        )
-        for _ in range(things)
-    ]
-    edges = []
-    for move in itertools.product((-1, 0, 1), repeat=len(shape)):
-        if any(move):
-            here = tuple(
-                slice(max(0, -one), size - max(0, one))
-                for one, size in zip(move, shape, strict=True)
-            )
-            there = tuple(
-                slice(max(0, one), size - max(0, -one))
-                for one, size in zip(move, shape, strict=True)
-            )
-            edges.append(np.stack([number[here].ravel(), number[there].ravel()], axis=1))
-    edges = np.concatenate(edges)
+    places = np.argwhere(np.ones(shape))
+    edges = np.argwhere(np.abs(places[:, None] - places).max(axis=-1) == 1)
     length = np.linalg.norm(places[edges[:, 0]] - places[edges[:, 1]], axis=1)
-    features = [length, *(length * (one[edges[:, 0]] + one[edges[:, 1]]) / 2 for one in near)]
+    things_at = rng.uniform(0, np.array(shape) - 1, (things, 2))
+    near = [np.exp(-0.5 * ((places - at) ** 2).sum(axis=1)) for at in things_at]
+    features = [length, *(length * one[edges].mean(axis=1) for one in near)]
     return PathProblem(edges, np.stack(features, axis=1), len(places), len(places) - 1)
 
 
@@ -94,9 +68,7 @@ def demonstrations(count: int, weights: np.ndarray, seed: int = 0, **kwargs) -> 
     for _ in range(count):
         problem = grid(rng, **kwargs)
         start = int(rng.integers(problem.nodes // 2))
-        found.append(
-            Demonstration(problem, cheapest_path(problem, plan(problem, weights), start)[0])
-        )
+        found.append(Demonstration(problem, plan(problem, weights).path(start)[0]))
     return found
 
 
@@ -106,6 +78,6 @@ def excess(weights: np.ndarray, truth: np.ndarray, seed: int = 1, **kwargs) -> f
     for _ in range(40):
         problem = grid(rng, **kwargs)
         start = int(rng.integers(problem.nodes // 2))
-        paid += cheapest_path(problem, plan(problem, weights), start)[1] @ truth
+        paid += plan(problem, weights).path(start)[1] @ truth
         least += plan(problem, truth).costs[start]
     return float(paid / least - 1)

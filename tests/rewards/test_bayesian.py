@@ -5,7 +5,7 @@ demonstrations leave open.
 import numpy as np
 import pytest
 
-from manip_il.chapter.rewards.bayesian import Choices, draw_posterior, fit, sample
+from manip_il.chapter.rewards.bayesian import Choices, draw_posterior, fit
 from manip_il.tasks.carry.grid import Demonstration, PathProblem, open_features, rivals
 from tests.rewards.grids import acyclic, all_paths, demonstrations, excess
 
@@ -29,23 +29,6 @@ def choose(sums: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> n
     return np.concatenate([sums[[one]], np.delete(sums, one, axis=0)])
 
 
-def test_chains_have_the_moments_of_the_density_and_agree():
-    mean, covariance = np.array([1.0, -2.0]), np.array([[1.0, 0.8], [0.8, 2.0]])
-    inverse = np.linalg.inv(covariance)
-    draws = sample(
-        lambda points: -0.5 * np.einsum("ci,ij,cj->c", points - mean, inverse, points - mean),
-        np.zeros((4, 2)),
-        1.7 * np.linalg.cholesky(covariance),
-        6_000,
-        np.random.default_rng(0),
-    )
-    pooled = draws.reshape(-1, 2)
-    assert pooled.mean(axis=0) == pytest.approx(mean, abs=0.15)
-    assert np.cov(pooled.T) == pytest.approx(covariance, rel=0.15)
-    for chain in draws:
-        assert chain.mean(axis=0) == pytest.approx(mean, abs=0.3)
-
-
 def test_the_likelihood_is_of_one_choice_among_all_paths():
     rng = np.random.default_rng(0)
     sums = [small_choices(rng) for _ in range(3)]
@@ -58,14 +41,14 @@ def test_many_choices_leave_the_weights_that_made_them():
     rng = np.random.default_rng(0)
     sums = [choose(small_choices(rng), TRUTH, rng) for _ in range(600)]
     found = draw_posterior(Choices.of(sums), rng, PRIOR)
-    assert found.mean == pytest.approx(TRUTH, rel=0.25)
-    low, high = found.ratios(0, 0.9).T
+    assert found.mean(axis=0) == pytest.approx(TRUTH, rel=0.25)
+    low, high = np.quantile(found / found[:, [0]], [0.05, 0.95], axis=0)
     assert ((low <= TRUTH) & (high >= TRUTH)).all()
 
 
 def test_what_is_learnt_plans_as_the_demonstrator_on_unseen_grids():
     found = fit(demonstrations(15, TRUTH, **SIZE), np.random.default_rng(0))
-    assert excess(found.mean, TRUTH, **SIZE) < 0.01
+    assert excess(found.mean(axis=0), TRUTH, **SIZE) < 0.01
 
 
 def test_a_feature_in_which_all_agree_is_open_and_keeps_its_prior():
@@ -77,4 +60,5 @@ def test_a_feature_in_which_all_agree_is_open_and_keeps_its_prior():
     rng = np.random.default_rng(0)
     found = rivals(shown, rng.exponential(PRIOR, (20, 3)))
     assert open_features(shown, found) == [2]
-    assert draw_posterior(Choices.of(found), rng, PRIOR).mean[2] == pytest.approx(PRIOR, rel=0.15)
+    draws = draw_posterior(Choices.of(found), rng, PRIOR)
+    assert draws[:, 2].mean() == pytest.approx(PRIOR, rel=0.15)

@@ -1,12 +1,10 @@
 """An action is joint targets and one opening, by name and within bounds."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from manip_il.errors import MismatchError, NotFiniteError
 from manip_il.robots.action_space import ActionSpace
 from manip_il.worlds.ladder.world import scene_of
 
@@ -21,11 +19,6 @@ SPACE = ActionSpace(
     scale=np.array([0.1, 0.1, 0.1, 0.08]),
     relative=np.array([True, True, True, False]),
 )
-
-
-def test_the_gripper_is_last():
-    assert len(SPACE) == 4
-    assert SPACE.join(np.array([1.0, 2.0, 3.0]), 0.05).tolist() == [1.0, 2.0, 3.0, 0.05]
 
 
 @given(arrays(np.float64, 3, elements=finite), finite)
@@ -44,20 +37,6 @@ def test_a_clipped_action_is_the_nearest_within_the_bounds(action: np.ndarray):
     np.testing.assert_array_equal(clipped[inside], action[inside])
     np.testing.assert_array_equal(SPACE.clip(clipped, 0), clipped)
     assert clipped[2] == action[2]  # it turns freely
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_an_action_that_is_not_finite_is_refused_with_its_step(bad: float):
-    with pytest.raises(NotFiniteError, match="action at step 17 is not finite"):
-        SPACE.clip(np.array([0.0, 0.0, bad, 0.0]), 17)
-
-
-@pytest.mark.parametrize("shape", [(3,), (5,), (1, 4), ()])
-def test_an_action_of_another_shape_is_refused_with_both(shape: tuple[int, ...]):
-    with pytest.raises(MismatchError) as caught:
-        SPACE.clip(np.zeros(shape), 0)
-    assert str(shape) in str(caught.value)
-    assert "(4,)" in str(caught.value)
 
 
 @every_robot

@@ -5,8 +5,7 @@ from typing import Any
 
 import pytest
 
-from manip_il.robots.files import _warn
-from manip_il.robots.robot import Robot
+from manip_il.robots.robot import Robot, _warn
 from manip_il.robots.spec import arm_spec
 from manip_il.robots.table import get_robot
 

@@ -7,11 +7,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from manip_il.errors import UsageError
-from manip_il.robots import ROBOTS
 from manip_il.robots.geometry import distance, outline
 from manip_il.robots.gripper import TOUCH, sweep
 from manip_il.robots.table import get_robot
@@ -85,15 +82,6 @@ def test_a_gap_that_stops_growing_is_refused_where_it_does_with_the_joints_that_
     assert 0.8 < start < end < 2.8
 
 
-@given(st.sampled_from(sorted(ROBOTS)), st.floats(-0.1, 0.3))
-def test_a_command_is_measured_as_its_opening_within_what_there_is(robot: str, opening: float):
-    gripper, qpos = world_of(robot).scene.gripper, world_of(robot).data.qpos.copy()
-    qpos[gripper.q] = gripper.command(opening)
-    assert gripper.opening(qpos) == pytest.approx(
-        np.clip(opening, gripper.least, gripper.most), abs=1e-9
-    )
-
-
 @pytest.mark.parametrize(
     ("openings", "offset", "touched"),
     [
@@ -112,18 +100,6 @@ def test_the_cube_is_touched_by_all_fingers_or_not_at_all(
 ):
     for opening in openings:
         assert with_cube(robot, opening, offset).touched(OBJECT) == touched
-
-
-@given(
-    st.sampled_from(sorted(ROBOTS)),
-    st.floats(-0.008, 0.008),
-    st.floats(-0.008, 0.008),
-    st.floats(0.005, 0.02),
-)
-def test_what_no_finger_is_near_is_never_touched(robot: str, x: float, z: float, beside: float):
-    # The distance of two boxes that stand apart is now and then said to be none.
-    room = world_of(robot).gripper.most - EDGE
-    assert not with_cube(robot, EDGE + min(room, 2 * beside), (x, 0, z)).touched(OBJECT)
 
 
 @every_robot

@@ -40,30 +40,23 @@ def problem_of_mink(
     return [np.asarray(one) for one in (problem.P, problem.q, problem.G, problem.h)]
 
 
-def test_the_program_of_ones_own_arm_is_minks(own: Robot, monkeypatch: pytest.MonkeyPatch):
-    compare(own, monkeypatch)
-
-
 @every_robot
 def test_the_program_is_minks(robot: str, monkeypatch: pytest.MonkeyPatch):
-    compare(get_robot(robot), monkeypatch)
-
-
-def compare(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     solved: list[Any] = []
     plain = daqp.solve
     monkeypatch.setattr(
         ik.daqp, "solve", lambda *problem: solved.append(problem) or plain(*problem)
     )
-    arm, rng = ArmIK(robot), np.random.default_rng(0)
+    the_robot, rng = get_robot(robot), np.random.default_rng(0)
+    arm, home = ArmIK(the_robot), np.asarray(the_robot.home)
     for _ in range(20):
-        q = np.asarray(robot.home) + rng.uniform(-0.3, 0.3, len(robot.home))
-        position = np.array([*robot.workspace.centre, 0.1]) + rng.uniform(-0.1, 0.1, 3)
+        q = home + rng.uniform(-0.3, 0.3, len(home))
+        position = np.array([*the_robot.workspace.centre, 0.1]) + rng.uniform(-0.1, 0.1, 3)
         rotation = hand_down(rng.uniform(-1, 1))
         arm.ee_pose(q)
         assert arm.displacement(position, rotation, 0.1) is not None
         for ours, theirs in zip(
-            solved[-1], problem_of_mink(robot, q, position, rotation), strict=False
+            solved[-1], problem_of_mink(the_robot, q, position, rotation), strict=False
         ):
             np.testing.assert_array_equal(ours, theirs)
 

@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 
 from manip_il.errors import UsageError
-from manip_il.robots.files import ModelFiles
+from manip_il.robots.found import suggest
 from manip_il.robots.geometry import rotation_matrix
-from manip_il.robots.robot import Robot
+from manip_il.robots.robot import ModelFiles, Robot
 from manip_il.robots.spec import arm_model, arm_spec, load
-from manip_il.robots.suggest import suggest
 from manip_il.robots.table import get_robot
 
 from .own import model_of, tree_of, write

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.robots import HERE, reach
-from manip_il.robots.geometry import Body, angle_between, hand_down, off_yaw
+from manip_il.robots import reach
+from manip_il.robots.geometry import angle_between, hand_down, off_yaw
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.reach import ARRIVES, STRETCH, Reach, reach_of
 from manip_il.robots.robot import Robot
@@ -110,30 +110,6 @@ def test_a_hand_that_leans_gets_where_an_upright_one_does_not(x: float):
     miss, angle = solve_from_home(ik, the_robot, place, 1.0)
     assert miss < 0.006
     assert angle < LEAN
-
-
-@every_robot
-def test_a_map_that_is_kept_is_what_would_be_worked_out_now(robot: str):
-    the_robot = get_robot(robot)
-    there, ik, body = reach_of(the_robot), ArmIK(the_robot), Body(the_robot)
-    draws = np.random.default_rng(2)
-    for _ in range(30):
-        index = tuple(draws.integers(there.errors.shape).tolist())
-        point = there.origin + CELL * np.array(index)
-        point[2] = max(point[2], the_robot.ee.lowest)
-        miss, q = reach._miss(the_robot, ik, point)
-        blocked = miss < reach._BLOCKED and body.meets_itself(q)
-        assert there.errors[index] == pytest.approx(
-            miss + (reach._BLOCKED if blocked else 0.0), abs=2e-3
-        )
-
-
-@every_robot
-def test_a_robot_that_ships_has_its_map_beside_it(robot: str):
-    the_robot = get_robot(robot)
-    assert reach._place(the_robot) == HERE / f"{robot}.reach.npz"
-    assert reach._place(the_robot).is_file()
-    assert reach_of(the_robot).has((*the_robot.workspace.centre, 0.1))
 
 
 @pytest.fixture

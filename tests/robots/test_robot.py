@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -14,7 +13,6 @@ from manip_il.robots.reach import Reach
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_model, arm_spec
 from manip_il.robots.table import get_robot
-from manip_il.sim.scene import PREFIX
 from manip_il.worlds.ladder.world import scene_of
 from manip_il.worlds.table import env_fingerprint, make_config
 
@@ -31,14 +29,6 @@ def refusal(path: Path, task: str = "reach") -> str:
     return str(caught.value)
 
 
-def test_an_arm_from_a_yaml_is_a_scene_and_has_the_files_name(tmp_path: Path):
-    path = write(tmp_path, "six_axes")
-    scene = scene_of(path, "reach")
-    assert scene.robot.name == "six_axes"
-    assert scene.robot.joint_names == ("turn", "shoulder", "elbow", "wrist", "roll", "gripper")
-    assert scene.name == "six_axes reach"
-
-
 def test_an_arm_from_a_yaml_is_driven_to_the_goal(tmp_path: Path, monkeypatch):
     # solving for its map takes long
     everywhere = Reach(np.array([-1.0, -1.0, 0.0]), np.zeros((41, 41, 21)))
@@ -47,13 +37,6 @@ def test_an_arm_from_a_yaml_is_driven_to_the_goal(tmp_path: Path, monkeypatch):
     env = started(str(write(tmp_path)), "reach", horizon=60)
     drive(env, 60)
     assert env.solved
-
-
-def test_a_yaml_is_found_from_the_current_folder(tmp_path: Path, monkeypatch):
-    write(tmp_path, "near")
-    monkeypatch.chdir(tmp_path)
-    assert get_robot(Path("near.yaml")).name == "near"
-    assert get_robot(Path("./near.yaml")).files.model == tmp_path / "own.xml"
 
 
 def test_an_arm_of_ones_own_is_known_by_what_its_yaml_says(tmp_path: Path):
@@ -118,15 +101,6 @@ def test_a_mistake_in_the_yaml_is_one_line(mistake: str, tmp_path: Path):
     assert str(path) in line or "robot own" in line
 
 
-def test_a_gripper_too_small_for_the_tasks_cube_is_one_line(tmp_path: Path):
-    path = write(tmp_path, tree=inside("gripper", open=[0.02, 0.02]))
-    line = refusal(path, "pick_place")
-    assert (
-        "task pick_place: 'object' is 0.050 m wide, and the gripper of own opens to 0.042 m" in line
-    )
-    assert scene_of(path, "reach").gripper.most < 0.05
-
-
 def test_nothing_that_belongs_to_a_world_is_left_of_a_model(own: Robot):
     spec = arm_spec(own)
     for kind in ("cameras", "lights", "sensors", "keys", "equalities", "textures"):
@@ -142,57 +116,10 @@ def test_nothing_that_belongs_to_a_world_is_left_of_a_model(own: Robot):
 
 
 @every_robot
-def test_a_scene_has_the_worlds_cameras_lamps_and_sky_alone(robot: str):
-    scene = scene_of(robot, "reach")
-    model = scene.model
-    assert sorted(model.camera(i).name for i in range(model.ncam)) == [
-        "front",
-        f"{PREFIX}wrist",
-        "side",
-    ]
-    assert all(model.light_bodyid == 0)
-    assert model.nsensor == model.nkey == 0
-    assert [model.body(i).name for i in range(model.nbody) if model.body_mocapid[i] >= 0] == [
-        "goal"
-    ]
-    skies = [
-        i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX
-    ]
-    assert [model.texture(i).name for i in skies] == ["sky"]
-    driven = {model.joint(int(model.actuator_trnid[i, 0])).name for i in range(model.nu)}
-    assert driven == {PREFIX + name for name in (*scene.robot.joints, *scene.robot.gripper.joints)}
-    assert model.nu == len(driven)
-
-
-def test_a_base_moves_the_robot(tmp_path: Path):
-    plain, moved = (
-        write(tmp_path, "plain"),
-        write(tmp_path, "moved", tree=tree_of() | {"base": [0.1, 0.2, -0.3]}),
-    )
-    ees = [ArmIK(get_robot(path)).ee_pose(np.zeros(5))[0] for path in (plain, moved)]
-    np.testing.assert_allclose(ees[1] - ees[0], [0.1, 0.2, -0.3], atol=1e-9)
-
-
-@every_robot
 def test_at_home_the_hand_points_down_over_the_workspace(robot: str):
     world = world_at_home(robot)
     np.testing.assert_allclose(world.ee.rotation, np.diag([1.0, -1.0, -1.0]), atol=0.05)
     assert np.hypot(*(world.ee.position[:2] - world.scene.robot.workspace.centre)) < 0.06
-
-
-@every_robot
-def test_the_fingers_move_along_the_hands_y(robot: str):
-    world, places = world_at_home(robot), []
-    gripper = world.scene.gripper
-    for opening in (gripper.least, gripper.most):
-        world.data.qpos[gripper.q] = gripper.command(opening)
-        world.update()
-        places.append(np.array([world.data.geom_xpos[pads[0]] for pads in gripper.pads]))
-    moved = (places[1] - places[0]) @ world.ee.rotation
-    moves = moved[np.abs(moved).max(axis=1) > 1e-9]  # of some one jaw alone
-    assert len(moves) == 2 - world.gripper.lopsided
-    assert (np.abs(moves[:, 1]) > 0.02).all()
-    assert world.robot.leans or (np.abs(moves[:, [0, 2]]) < 0.4 * np.abs(moves[:, [1]])).all()
 
 
 @every_robot

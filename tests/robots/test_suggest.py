@@ -8,7 +8,7 @@ import yaml
 
 from manip_il.cli.main import main
 from manip_il.errors import UsageError
-from manip_il.robots.suggest import suggest
+from manip_il.robots.found import suggest
 from manip_il.robots.table import get_robot, read_robot
 
 from .own import ARM, JAWS, model_of, tree_of

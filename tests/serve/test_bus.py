@@ -49,10 +49,6 @@ def test_every_servo_answers_a_broadcast_and_an_absent_one_nothing(bus: Bus):
     assert bus.feed(packet(9, PING)) == b""
 
 
-def test_a_servo_says_that_it_is_an_sts3215(bus: Bus):
-    assert bus.feed(packet(1, READ, 3, 2)) == packet(1, 0, 777 & 0xFF, 777 >> 8)
-
-
 def test_position_is_the_encoder_less_the_offset(bus: Bus):
     bus["Homing_Offset"] = -100
     bus.show(CENTRE)

@@ -42,25 +42,16 @@ def run(tmp_path: Path, start: Callable[..., ForkServerProcess]) -> Run:
         program: str, *words: str, arms: str = "follower leader", served: tuple[str, ...] = ()
     ) -> list[Episode]:
         root, path = tmp_path / "arm", Path(sys.executable).with_name(program)
-        robot = [
-            "--robot.type=so101_follower",
-            f"--robot.port={root}/follower",
-            "--robot.id=follower",
-        ]
-        teleop = [
-            "--teleop.type=so101_leader",
-            f"--teleop.port={root}/leader",
-            "--teleop.id=leader",
-        ]
-        robot, teleop = (
-            [*robot, f"--robot.calibration_dir={root}"],
-            [*teleop, f"--teleop.calibration_dir={root}"],
-        )
-        options = [
-            *(robot if "follower" in arms else []),
-            *(teleop if "leader" in arms else []),
-            *words,
-        ]
+        options = [*words]
+        for arm in arms.split():
+            name = "robot" if arm == "follower" else "teleop"
+            values = {
+                "type": f"so101_{arm}",
+                "id": arm,
+                "port": root / arm,
+                "calibration_dir": root,
+            }
+            options += [f"--{name}.{key}={value}" for key, value in values.items()]
         own = [
             "serve",
             "--task.type=lift",
@@ -74,11 +65,8 @@ def run(tmp_path: Path, start: Callable[..., ForkServerProcess]) -> Run:
                 shutil.rmtree(old) if old.is_dir() else old.unlink()
             served_by = start(*own, "--", str(path), *options, log=tmp_path / "said")
             served_by.join()
-            code, said, tries = (
-                served_by.exitcode,
-                (tmp_path / "said").read_text(errors="replace"),
-                tries + 1,
-            )
+            tries += 1
+            code, said = served_by.exitcode, (tmp_path / "said").read_text(errors="replace")
         assert code == 0, said[-3000:]
         return [read_journal(path)[1] for path in list_episodes(tmp_path / "log")]
 

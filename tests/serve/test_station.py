@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 from lerobot.robots.so_follower import SO101Follower, SOFollowerRobotConfig
@@ -17,8 +16,6 @@ from lerobot.teleoperators.so_leader import SO101Leader, SOLeaderTeleopConfig
 
 from manip_il.cli.main import main
 from manip_il.errors import UsageError
-from manip_il.mdp import F64
-from manip_il.serve import operator, session
 from manip_il.serve.config import ServoConfig, SessionConfig
 from manip_il.serve.station import Station
 from manip_il.worlds.ladder.world import env_of
@@ -100,44 +97,10 @@ def test_a_lower_gain_sags_more(station: Station):
     assert np.abs(station.follower.sag()).max() == pytest.approx(2 * sag)
 
 
-def test_the_weight_of_a_session_is_raised_and_given_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """On systems that do not weigh sessions the file is empty or missing."""
-    group = tmp_path / "autogroup"
-    monkeypatch.setattr(operator, "_AUTOGROUP", group)
-    assert operator.weigh_session() == ""  # no such file
-    group.write_text("")
-    assert operator.weigh_session() == ""
-    group.write_text("/autogroup-12 nice 3\n")
-    assert operator.weigh_session() == "3"
-    assert group.read_text() == "-20"
-
-
 def test_servos_that_vary_differ_within_their_ranges():
     drawn = [ServoConfig().varied(np.random.default_rng(seed)) for seed in range(50)]
     assert len({one.stiffness for one in drawn}) == 50
     assert all(0.7 * 27 <= one.stiffness <= 1.3 * 27 and 0 <= one.delay <= 0.035 for one in drawn)
-
-
-def test_the_sliders_of_a_window_move_the_leader_and_follow_a_new_world(
-    station: Station, monkeypatch: pytest.MonkeyPatch
-):
-    class FakeWindow:
-        def __init__(self, *given: object, **options: object) -> None:
-            self.commands = np.zeros(0)
-
-        def show(self, data: mujoco.MjData, variation: F64) -> None:
-            self.commands = data.ctrl + 0.1 * (len(self.commands) == 0)
-
-    monkeypatch.setattr(session, "Window", FakeWindow)
-    start = station.env.data.qpos[station.follower.q]
-    move = session.slider_mover(station)
-    first = move()
-    station.env.simulate()
-    assert np.allclose([first, move()], [start, start + 0.1])
-    station.reset(2)
-    assert np.allclose(np.array(move()), station.env.data.qpos[station.follower.q])
 
 
 def test_the_expert_at_the_leader_solves_the_task_through_the_servos(station: Station):

@@ -7,9 +7,7 @@ import pytest
 from manip_il.robots import ROBOTS
 from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, CameraConfig
-from manip_il.sim.points import point_names, points_in
-from manip_il.sim.props import Prop
-from manip_il.sim.render import pictures, projections
+from manip_il.sim.render import Prop, pictures, point_names, points_in, projections
 from manip_il.tasks.table import TASKS
 
 from ..scenes import SEED, started

@@ -9,7 +9,7 @@ from manip_il.robots import ROBOTS
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CAMERAS
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.props import props
+from manip_il.sim.render import props
 from manip_il.sim.variation import part
 from manip_il.worlds.ladder.world import make_env
 

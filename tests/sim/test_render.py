@@ -74,19 +74,6 @@ def test_the_wrist_camera_moves_with_the_hand_and_the_front_camera_does_not(env:
 
 @pytest.mark.gl
 @with_one_robot
-def test_pictures_of_25_environments_are_those_of_one_alone(env: ManipEnv):
-    crowd = [
-        started(env.scene.robot.name, seed=seed, cameras=CAMERAS) for seed in range(SEED, SEED + 25)
-    ]
-    together = [one.observe().images for one in crowd]
-    for seed, images in enumerate(together, SEED):
-        env.start(seed)
-        for camera, picture in env.observe().images.items():
-            np.testing.assert_array_equal(images[camera], picture)
-
-
-@pytest.mark.gl
-@with_one_robot
 def test_nothing_that_is_drawn_in_between_changes_a_byte(env: ManipEnv):
     def same() -> bool:
         return all(

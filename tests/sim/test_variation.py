@@ -24,29 +24,6 @@ WHERE_IT_WAS_MADE = {"body_pos", "qpos0", "qpos_spring", "cam_poscom0", "light_p
 NO_MOTORS = np.array([], dtype=np.int64)
 
 
-CUBE, TALL = [0.025, 0.025, 0.025, 0.1, 1.0], [0.01, 0.02, 0.04, 0.1, 1.0]
-
-
-@pytest.mark.parametrize(
-    ("before", "drawn", "after"),
-    [
-        (CUBE, {"size": 0.07}, [0.035, 0.035, 0.035, 0.1, 1.0]),
-        (TALL, {"size": 0.04}, [0.005, 0.01, 0.02, 0.1, 1.0]),  # the longest edge; proportions stay
-        (CUBE, {"mass": 0.3}, [0.025, 0.025, 0.025, 0.3, 1.0]),
-        (CUBE, {"friction": 0.5}, [0.025, 0.025, 0.025, 0.1, 0.5]),
-        (CUBE, {"colour": [1, 0, 0]}, CUBE),
-        (CUBE + TALL, {"mass": 0.2}, [0.025, 0.025, 0.025, 0.2, 1.0, 0.01, 0.02, 0.04, 0.2, 1.0]),
-        ([], {"mass": 0.2, "size": 0.05}, []),
-    ],
-)
-def test_what_is_drawn_stands_at_its_place_and_the_rest_as_it_was(
-    before: list[float], drawn, after: list[float]
-):
-    base = np.array([*before, *NOTHING_DRAWN])
-    np.testing.assert_allclose(with_drawn(base, drawn)[: len(after)], after)
-    assert base.tolist() == [*before, *NOTHING_DRAWN]
-
-
 @pytest.mark.parametrize("task", ["pick_place", "lift"])
 @pytest.mark.parametrize(
     ("given", "drawn", "same_as"),

@@ -4,7 +4,7 @@ import gymnasium
 import pytest
 
 from manip_il.errors import RenderError, UsageError
-from manip_il.sim.window import Clock
+from manip_il.sim.view import Clock
 from manip_il.worlds.ladder.world import make_env
 
 

@@ -3,13 +3,10 @@ fingerprint.
 """
 
 import copy
-from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -20,11 +17,12 @@ from manip_il.data.schema import EXPERT_PHASE
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.events import STANDARD
+from manip_il.sim.scene import Scene
 from manip_il.sim.task import NO_PHASE, phases
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks import NAMES
 from manip_il.tasks.starts import UPRIGHT
-from manip_il.tasks.table import TASKS, get_task
+from manip_il.tasks.table import TASKS
 from manip_il.worlds.ladder import world
 from manip_il.worlds.ladder.world import make_env, scene_of
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config
@@ -40,13 +38,6 @@ RARE = {  # rungs with tests of their own
     "insert_tight": {"let_stand"},
     "sort": {"put_back"},
 }
-
-
-@every_task
-def test_a_task_has_the_name_that_it_is_called_by(task: str):
-    assert get_task(task) is TASKS[task]
-    assert TASKS[task].name == task
-    assert TASKS[task].instruction.endswith(".")
 
 
 def test_help_names_every_task():
@@ -83,6 +74,7 @@ def test_the_last_rung_holds_everywhere(robot: str, task: str):
             turn = rng.normal(size=4)
             world.place(name, rng.uniform(-1, 1, 3), turn / np.linalg.norm(turn))
         world.update()
+        assert 0 <= TASKS[task].progress(world) <= 1
         assert TASKS[task].rungs[-1].holds(world)
         for rung in TASKS[task].rungs:
             target = rung.target(world)
@@ -150,17 +142,6 @@ def test_progress_never_falls_along_the_experts_path_and_ends_at_one(
 
 
 @every_scene
-def test_progress_is_a_share_wherever_the_arm_gets_to(robot: str, task: str):
-    env = make_env(robot, task)
-    for seed in SEEDS:
-        env.start(seed)
-        rng = np.random.default_rng(seed)
-        for _ in range(30):
-            env.advance(env.scene.actions.random_near(env.observe().state, rng))
-            assert 0 <= TASKS[task].progress(env.world) <= 1
-
-
-@every_scene
 def test_what_is_solved_is_at_the_goal_within_the_tolerance_and_what_is_not_is_not(
     robot: str, task: str
 ):
@@ -188,23 +169,15 @@ def test_what_is_solved_is_at_the_goal_within_the_tolerance_and_what_is_not_is_n
         assert fresh.progress < env.progress
 
 
-# Of one joint's motor, of one thing's weight, of the light: whatever it is, it is another model.
-CHANGES: dict[str, Callable[[mujoco.MjModel], None]] = {
-    "a gain": lambda model: model.actuator_gainprm.__imul__(1.01),
-    "a weight": lambda model: model.body_mass.__imul__(1.01),
-    "a friction": lambda model: model.geom_friction.__imul__(1.01),
-    "a place": lambda model: model.body_pos.__iadd__(1e-6),
-    "the step": lambda model: setattr(model.opt, "timestep", 0.0021),
-}
-
-
-@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize(
+    "change", ["actuator_gainprm", "body_mass", "geom_friction", "body_pos", "qpos0"]
+)
 def test_the_fingerprint_changes_with_the_model(change: str, monkeypatch):
     config, scene = make_config(), scene_of("panda", "pick_place")
     before = env_fingerprint(config)
     model = copy.copy(scene.model)
-    CHANGES[change](model)
-    monkeypatch.setattr(world, "config_scene", lambda _: replace(scene, model=model))
+    getattr(model, change)[...] += 1e-6
+    monkeypatch.setattr(world, "config_scene", lambda _: Scene(scene.robot, scene.task, model))
     after = world.WORLD.fingerprint(config)
     assert {key for key in before if before[key] != after[key]} == {"model_sha256"}
 

@@ -15,13 +15,16 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.env import environment_state_names
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import Lie, lie_of
-from manip_il.tasks.pick_place import OBJECT, observe_object
+from manip_il.tasks.objects import observe_object
+from manip_il.tasks.pick_place import OBJECT
+from manip_il.tasks.starts import UPWARDS, product, turn_left
 from manip_il.worlds.ladder.world import make_env
 from manip_il.worlds.table import make_config
 
 from ..scenes import SEED, started
 
 SHAPES = (
+    "box:0.05",
     "box:0.06x0.04x0.03",
     "box:0.03x0.03x0.06",
     "cylinder:0.04x0.06",
@@ -39,12 +42,8 @@ def world_of(shape: str) -> World:
 
 def turned(world: World, yaw: float, up: int) -> Lie:
     """The object on the table, its own axis `up` upwards, turned about the vertical."""
-    upwards = ([0.5**0.5, 0, -(0.5**0.5), 0], [0.5**0.5, 0.5**0.5, 0, 0], [1, 0, 0, 0])[up]
-    quaternion = np.empty(4)
-    mujoco.mju_mulQuat(
-        quaternion, np.array([math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]), np.array(upwards, float)
-    )
-    world.place(OBJECT, np.array([0.5, 0.0, world.extents(OBJECT)[up] / 2]), quaternion)
+    at = np.array([0.5, 0.0, world.extents(OBJECT)[up] / 2])
+    world.place(OBJECT, at, product(turn_left(yaw), UPWARDS[up]))
     world.update()
     return lie_of(world, OBJECT)
 
@@ -88,10 +87,6 @@ def test_what_looks_alike_is_observed_alike(shape: str, yaw: float, up: int):
 
 
 def test_a_cube_is_observed_as_ever_and_other_shapes_with_their_lengths():
-    assert (
-        len(environment_state_names(make_env().scene))
-        == len(environment_state_names(world_of("sphere:0.04").scene)) - 3
-    )
     cube = [
         name
         for name in environment_state_names(make_env(object="box:0.03").scene)
@@ -114,21 +109,15 @@ def test_a_cube_is_observed_as_ever_and_other_shapes_with_their_lengths():
         ("capsule:0.03x0.06", {0.03}),
     ],
 )
-def test_starts_lie_and_stand_where_the_shape_has_it_and_at_any_yaw(
-    shape: str, heights: set[float]
-):
-    yaws, found = [], set()
+def test_starts_lie_and_stand_where_the_shape_has_it(shape: str, heights: set[float]):
+    found = set()
     for seed in range(SEED, SEED + 40):
         env = started(seed=seed, object=shape)
         lie, at = lie_of(env.world, OBJECT), env.world.pose(OBJECT).position
         assert lie.tilt == pytest.approx(0, abs=1e-6)
         assert at[2] == pytest.approx(lie.tall / 2)
         found.add(round(lie.tall, 6))
-        long = env.world.pose(OBJECT).rotation[:, 2]
-        yaws.append(math.atan2(long[1], long[0]))
     assert found == heights
-    if shape.startswith("capsule"):
-        assert max(yaws) - min(yaws) > 1.8 * math.pi * 0.9
 
 
 @pytest.mark.parametrize(

@@ -1,28 +1,23 @@
-"""The task `insert`: where the peg starts, how the hand turns it, and that it ends up in the
-hole.
-"""
+"""The task `insert`: the hole, where the peg starts, and how the hand turns it."""
 
 import math
 
 import numpy as np
 import pytest
 
-from manip_il import Expert
 from manip_il.seeding import stream_seeds
-from manip_il.sim.task import phases
 from manip_il.sim.world import World
 from manip_il.tasks.insert import APART
-from manip_il.tasks.peg import HOLE, PEG, lower_end
-from manip_il.tasks.table import TASKS
+from manip_il.tasks.peg import HOLE, PEG
 from manip_il.worlds.ladder.world import make_env, scene_of
 
+from ..scenes import solve, started
 from ..tables import every_robot
 
-PLAYS = {"insert": 0.002, "insert_tight": 0.0005}
 SEEDS = stream_seeds("certificate", 6)
 
 
-@pytest.mark.parametrize(("task", "play"), PLAYS.items())
+@pytest.mark.parametrize(("task", "play"), [("insert", 0.002), ("insert_tight", 0.0005)])
 def test_the_hole_is_wider_than_the_peg_by_the_play(task: str, play: float):
     world = World(scene_of("panda", task))
     left, right = (world.model.geom(f"hole {side}") for side in ("left", "right"))
@@ -43,27 +38,6 @@ def test_the_peg_starts_standing_or_lying_apart_from_the_hole(robot: str):
     assert up == {True, False}
 
 
-@pytest.mark.parametrize("task", PLAYS)
-def test_the_expert_puts_a_standing_and_a_lying_peg_into_the_hole(task: str):
-    env = make_env("panda", task)
-    expert = Expert(env.scene)
-    for seed in SEEDS[:3]:  # one of them lies
-        env.start(seed)
-        for _ in range(env.config.horizon):
-            env.advance(expert.label(env.get_state()).action)
-            if env.solved:
-                break
-        assert env.solved
-        assert lower_end(env.world)[2] < 0.004
-
-
 def test_a_peg_that_the_arm_cannot_lean_over_far_enough_is_set_upright_first():
-    env = make_env("fetch", "insert")
-    expert, names, seen = Expert(env.scene), phases(TASKS["insert"]), list[str]()
-    env.start(SEEDS[0])
-    while not env.solved and len(seen) < env.config.horizon:
-        label = expert.label(env.get_state())
-        seen.append(names[label.phase])
-        env.advance(label.action)
-    assert env.solved
+    seen = solve(started("fetch", "insert", SEEDS[0]))
     assert seen.index("set_up") < seen.index("let_stand") < len(seen) - seen[::-1].index("grasp")

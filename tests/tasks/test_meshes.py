@@ -2,22 +2,17 @@
 data without a path.
 """
 
-import pickle
-from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import trimesh
-import zstandard
 
-import manip_il
 from manip_il import Expert
 from manip_il.cli.main import main
 from manip_il.collect.edits import open_source
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UsageError
 from manip_il.sim.rests import LEAST_ROOM
 from manip_il.sim.shape import DENSITY, LIGHTEST, ObjectShape
@@ -55,13 +50,8 @@ def test_the_expert_brings_it_to_its_goal(name, robot, folder):
 @pytest.mark.parametrize("task", ["lift", "carry"])
 def test_other_tasks_take_it_too(task, folder):
     config = make_config("panda", task, object=text(folder, "mug"))
-    assert (
-        sum(
-            episode.success
-            for episode in RolloutJob(config, hold=0).run(range(3_000_000, 3_000_003))
-        )
-        >= 2
-    )
+    episodes = RolloutJob(config, hold=0).run(range(3_000_000, 3_000_003))
+    assert sum(episode.success for episode in episodes) >= 2
 
 
 @pytest.mark.parametrize("ending", [".stl", ".obj", ".ascii.stl"])
@@ -124,12 +114,6 @@ def test_a_side_that_is_too_wide_has_no_label_and_says_why(tmp_path):
     label = expert.label(env.get_state())
     assert not label.valid
     assert "too low or too wide for the gripper" in label.reason
-    plate = make_env("panda", object=f"mesh:{write_mesh('plate', tmp_path)}")
-    plate.reset(seed=0)
-    settled(plate.world, np.array([1.0, 1.0, 0.0, 0.0]))
-    assert (
-        "too low or too wide for the gripper" in Expert(plate.scene).label(plate.get_state()).reason
-    )
 
 
 def test_data_have_its_name_and_hash_and_no_path(folder, tmp_path):
@@ -141,7 +125,7 @@ def test_data_have_its_name_and_hash_and_no_path(folder, tmp_path):
     moved = tmp_path / "mug.obj"
     moved.write_bytes((folder / "mug.obj").read_bytes())
     assert env_fingerprint(make_config("panda", object=f"mesh:{moved}:0.06")) == before
-    assert world_of("panda").own_files("panda", "pick_place", spec.object)
+    assert world_of("panda").own_files(spec, spec.object)
     with pytest.raises(
         UsageError,
         match=r"name of the mesh was stored; give --task\.object=mesh:PATH/mug\.obj:0\.06",
@@ -163,40 +147,14 @@ def test_a_dataset_and_an_evaluation_of_it_are_used_with_its_file(
     with pytest.raises(ManipError, match=r"give --task\.object=mesh:PATH/bowl\.obj"):
         open_source(tmp_path / "data")
     assert main(["data", "relabel", "data", f"--task.object={mesh}", "--workers=1"]) == 0
-    assert (
-        main(
-            [
-                "data",
-                "relabel",
-                "data",
-                f"--task.object={text(folder, 'mug')}",
-                "--workers=1",
-                "--overwrite=true",
-            ]
-        )
-        == 1
-    )
+    other = f"--task.object={text(folder, 'mug')}"
+    assert main(["data", "relabel", "data", other, "--workers=1", "--overwrite=true"]) == 1
     capsys.readouterr()
     assert main(["eval", "--policy.type=expert", f"--task.object={mesh}", *few]) == 0
     assert f"--task.object={mesh} --replay=" in capsys.readouterr().out
     assert main(["eval", "e", "--replay=4000000"]) in (1, 2)
     assert "--task.object=mesh:PATH/bowl.obj" in capsys.readouterr().err
     assert main(["eval", "e", "--replay=4000000", f"--task.object={mesh}"]) == 0
-
-
-def test_a_node_gets_the_file(folder, tmp_path):
-    path = write_mesh("wedge", tmp_path)
-    job = RolloutJob(make_config("panda", object=f"mesh:{path}"), hold=0)
-    [here], files = list(job.run([5])), {"wedge.obj": path.read_bytes()}
-    path.unlink()
-    away = replace(
-        job, env=replace(job.env, object=Path(f"mesh:{tmp_path / 'elsewhere' / 'wedge.obj'}"))
-    )
-    [(there, _)] = pickle.loads(
-        zstandard.decompress(run_there(manip_il.__version__, away, (5,), None, None, files))
-    )
-    for name, column in here.without_pictures().columns.items():
-        np.testing.assert_array_equal(there.columns[name], column)
 
 
 def open_box(path: Path) -> None:
@@ -222,7 +180,6 @@ MISTAKES = {
         "own.obj",
         "own.obj is empty",
     ),
-    "has no bytes": (lambda path: path.write_bytes(b""), "own.stl", "own.stl is empty"),
     "is in millimetres": (
         trimesh.creation.box((50, 40, 30)).export,
         "own.stl",
@@ -231,14 +188,11 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize(
-    "command", [["eval", "--policy.type=expert", "--output_dir=out"], ["record"]]
-)
 @pytest.mark.parametrize("case", MISTAKES)
-def test_a_mesh_that_cannot_be_used_is_one_line(case, command, tmp_path, monkeypatch, capsys):
+def test_a_mesh_that_cannot_be_used_is_one_line(case, tmp_path, monkeypatch, capsys):
     write, name, says = MISTAKES[case]
     monkeypatch.chdir(tmp_path)
     write(tmp_path / name)
-    assert main([*command, f"--task.object=mesh:{tmp_path / name}"]) == 2
+    assert main(["record", f"--task.object=mesh:{tmp_path / name}"]) == 2
     error = capsys.readouterr().err
     assert (error.count("\n"), says in error) == (1, True), error

@@ -4,6 +4,7 @@ it.
 
 import pickle
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -14,16 +15,20 @@ import zstandard
 import manip_il
 from manip_il.cli.main import main
 from manip_il.collect.edits import open_source
+from manip_il.collect.inputs import own_files
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
+from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
 from manip_il.robots import table as robots
-from manip_il.sim.points import point_names
+from manip_il.sim.render import point_names
 from manip_il.tasks import table
 from manip_il.tasks.table import get_task
 from manip_il.worlds.ladder.world import scene_of
-from manip_il.worlds.table import env_fingerprint, env_spec, make_config, world_of
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config
+
+from ..meshes import write_mesh
 
 PAGE = Path(__file__).parents[2] / "docs" / "new-task.md"
 TOUCH, RAISE = (block.split("```", 1)[0] for block in PAGE.read_text().split("```python\n")[1:])
@@ -81,6 +86,21 @@ def test_an_own_object_is_replaced_by_the_one_that_is_asked_for(tmp_path):
     assert make_config("panda", str(tmp_path / "own.py"), object="cylinder:0.04x0.06") == asked[""]
 
 
+def test_a_node_gets_the_files_of_task_and_mesh(tmp_path):
+    (tmp_path / "own.py").write_text(CYLINDER)
+    mesh = write_mesh("wedge", tmp_path)
+    own = make_config("panda", str(tmp_path / "own.py"), object=f"mesh:{mesh}")
+    tasks, meshes = ({path.name: path.read_bytes()} for path in (tmp_path / "own.py", mesh))
+    job = RolloutJob(own, hold=0)
+    [here] = list(job.run([5]))
+    mesh.unlink()
+    away = replace(job, env=replace(own, object=Path(f"mesh:{tmp_path / 'away' / mesh.name}")))
+    answer = run_there(manip_il.__version__, away, (5,), None, None, tasks, meshes)
+    [(there, _)] = pickle.loads(zstandard.decompress(answer))
+    for name, column in here.without_pictures().columns.items():
+        np.testing.assert_array_equal(there.columns[name], column)
+
+
 def test_files_that_were_edited_since_they_were_read_are_refused(tmp_path, touch):
     arm = tmp_path / "arm.yaml"
     arm.write_bytes(ROBOTS["so101"].read_bytes())
@@ -131,8 +151,8 @@ def test_data_and_results_name_a_task_and_run_nothing(touch, tmp_path, monkeypat
     words = ["--dataset.num_episodes=2", "--dataset.root=data", "--workers=1"]
     assert main(["record", f"--task.type={touch}", *words]) == 0
     assert main(["data", "check", "data"]) == 0
-    assert world_of("panda").own_files("panda", "touch", "")
-    with pytest.raises(ManipError, match="unknown task 'touch'"):
+    assert own_files(Dataset.open(tmp_path / "data").spec) == ["--task.type=FILE.py"]
+    with pytest.raises(ManipError, match=r"a file of your own; give --task\.type=FILE\.py$"):
         open_source(tmp_path / "data")
     assert open_source(tmp_path / "data", task=touch).warnings == ()
     assert main(["eval", "--policy.type=expert", f"--task.type={touch}", "--eval.n_episodes=2", "--eval.films=0",
@@ -173,16 +193,6 @@ def test_a_policy_of_it_is_evaluated_by_its_path_without_a_warning(
     assert "differs" not in capsys.readouterr().err
 
 
-def test_a_node_gets_the_file(touch):
-    job = RolloutJob(make_config("panda", str(touch)), hold=0)
-    files, [here] = {"touch.py": touch.read_bytes()}, list(job.run([5]))
-    touch.unlink()
-    answer = run_there(manip_il.__version__, job, (5,), None, files, None)
-    [(there, _)] = pickle.loads(zstandard.decompress(answer))
-    for name, column in here.without_pictures().columns.items():
-        np.testing.assert_array_equal(there.columns[name], column)
-
-
 MISTAKES = {
     "is not Python": ("def (", "cannot be run: SyntaxError"),
     "lacks a function": (
@@ -209,17 +219,8 @@ def test_a_file_that_holds_no_task_is_one_line(case, tmp_path, capsys):
     content, says = MISTAKES[case]
     path = tmp_path / "own.py"
     path.write_text(content)
-    assert (
-        main(
-            [
-                "eval",
-                "--policy.type=expert",
-                f"--task.type={path}",
-                f"--output_dir={tmp_path / 'e'}",
-            ]
-        )
-        == 2
-    )
+    words = [f"--task.type={path}", f"--output_dir={tmp_path / 'e'}"]
+    assert main(["eval", "--policy.type=expert", *words]) == 2
     error = capsys.readouterr().err
     assert (error.count("\n"), says in error) == (1, True), error
 

@@ -10,7 +10,6 @@ from manip_il.chapter.theory.bounds import (
     RIGHT,
     WRONG,
     Process,
-    clone,
     curves,
     losses_of,
 )
@@ -93,9 +92,3 @@ def test_any_policy_keeps_to_both_bounds(process):
 
 def test_u_is_what_one_wrong_step_costs():
     assert [one.recoverability(50) for one in PROCESSES] == pytest.approx([2, 50, 1])
-
-
-def test_a_clone_does_as_the_expert_where_it_has_data_and_the_worst_elsewhere(process):
-    seen = np.random.default_rng(0).random((6, process.states)) < 0.5
-    costly = process.wrong_costs(6) > 0
-    assert (clone(process, seen) == (costly & ~seen)).all()

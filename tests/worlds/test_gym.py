@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 import manip_il
 from manip_il.cli.main import main
 from manip_il.collect.edits import EditTarget, open_source, relabel_dataset
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.ray_pool import run_there
 from manip_il.errors import ManipError, UsageError
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.config import EnvConfig
@@ -125,6 +128,13 @@ def test_an_expert_with_memory_is_asked_once_in_every_step(tmp_path):
     assert labels[0] is labels[1]
     with pytest.raises(UsageError, match="keeps memory"):
         make_expert(env).label(one.get_state())
+
+
+def test_a_ray_node_gets_the_file(tmp_path):
+    env = config(tmp_path, POINT)
+    away = RolloutJob(replace(env, robot=Path("elsewhere/own.py")))
+    files = {"own.py": POINT.encode()}
+    assert run_there(manip_il.__version__, away, (5,), None, files, None, None)
 
 
 def test_the_environment_ends_an_episode(tmp_path):

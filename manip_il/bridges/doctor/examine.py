@@ -1,4 +1,4 @@
-"""Run every check on a dataset, and repair it from its journals or its own data."""
+"""Run every check on a dataset, and repair what follows from its data."""
 
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -10,15 +10,14 @@ import numpy as np
 
 from manip_il import checks
 from manip_il.bridges.doctor import files, learning
-from manip_il.bridges.doctor.files import Finding, journals_of
+from manip_il.bridges.doctor.files import Finding
 from manip_il.data.atomic import exclusive
-from manip_il.data.build import build
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import NUMBERS
-from manip_il.data.lerobot_layout import DATA_FILES, EPISODE_INDEX, INFO, STATS, write_json
+from manip_il.data.lerobot_layout import DATA_FILES, INFO, STATS, write_json
 from manip_il.data.parquet_files import count_rows
 from manip_il.data.statistics import Statistics, column_statistics, picture_statistics, to_lists
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UsageError
 
 Check = Callable[[Dataset], Iterator[Finding]]
 CHECKS: tuple[Check, ...] = (*files.CHECKS, *learning.CHECKS)
@@ -26,9 +25,10 @@ _PICTURES = 100  # pictures per camera from which statistics are computed
 
 
 def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
-    """Return all findings about a folder, [] for a sound dataset. Never raises.
+    """Return all findings about a folder, [] for a sound dataset.
 
-    If the folder is not a dataset, this is the only finding.
+    If the folder is not a dataset, this is the only finding. Raises only `UsageError`, if there is
+    no such folder.
 
     Args:
         root: The folder.
@@ -42,6 +42,8 @@ def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
                 found += check(dataset)
             except Exception as problem:  # a failing check must not hide the others
                 found.append(_explain(root, problem))
+    except UsageError:
+        raise
     except ManipError as problem:
         found.append(_explain(root, problem))
     return list(dict.fromkeys(found))  # several checks may report the same file
@@ -54,18 +56,11 @@ def _explain(root: Path, problem: Exception) -> Finding:
     return Finding(str(root), text.removeprefix(f"{root}: "))
 
 
-def has_errors(findings: Sequence[Finding]) -> bool:
-    """Return whether one of the findings is an error."""
-    return any(finding.is_error for finding in findings)
+def repair(root: Path) -> Iterator[str]:
+    """Compute counts and statistics again if they are wrong; yield one line for each repair.
 
-
-def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
-    """Repair what can be repaired.
-
-    Yield one line for each repair, or for the reason why one was not possible.
-
-    Nothing is deleted: replaced and moved files are kept in `ROOT.before-repair`. Check the dataset
-    again afterwards.
+    Nothing is deleted: replaced files are kept in `ROOT.before-repair`. Check the dataset again
+    afterwards.
 
     Raises:
         ManipError: if `ROOT.before-repair` exists, if a link leads outside, or while another
@@ -82,51 +77,16 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
             " instead"
         )
     with exclusive(root):
-        if has_errors(findings) and journals_of(root).is_dir():
-            yield _rebuild(root, kept)
-        for path in files.leftovers(root):
-            kept.mkdir(exist_ok=True)
-            shutil.move(path, kept)
-            yield f"moved away: {path.name}"
         for name, compute in ((INFO, _recount), (STATS, _recompute)):
             with suppress(ManipError, OSError, ValueError):  # unreadable files remain findings
                 if content := compute(root):
                     kept.mkdir(exist_ok=True)
-                    for path in root.glob(name):
-                        shutil.copy2(path, kept)
+                    if (root / name).exists():
+                        shutil.copy2(root / name, kept)
                     write_json(root / name, content)
                     yield f"computed from the data: {name}"
         if kept.exists():
-            yield f"replaced and moved files are kept in {kept}"
-
-
-def _rebuild(root: Path, kept: Path) -> str:
-    """Build the dataset from its journals, unless they hold fewer episodes than it does, or
-    another recording.
-    """
-    journals, fresh = journals_of(root), root.with_name(f".{root.name}.rebuilt.partial")
-    try:
-        info, _ = build(journals, fresh, replace=True)
-    except ManipError as problem:
-        return f"not rebuilt: {problem}"
-    reason = ""
-    with suppress(ManipError, LookupError):  # if the dataset cannot be read
-        was, now = (
-            (data.spec.robot, data.provenance["seeds"][0])
-            for data in map(Dataset.open, (root, fresh))
-        )
-        if was != now:
-            reason = "holds another recording; move it elsewhere"
-    with suppress(ManipError):
-        readable = len(np.unique(Dataset.open(root).columns([EPISODE_INDEX])[EPISODE_INDEX]))
-        if info.episodes < readable:
-            reason = f"holds {info.episodes} episodes, but {readable} are still readable"
-    if reason:
-        shutil.rmtree(fresh)
-        return f"not rebuilt: {journals.name} {reason}"
-    root.rename(kept)
-    fresh.rename(root)
-    return f"rebuilt from {journals.name}: {info.episodes} episodes"
+            yield f"replaced files are kept in {kept}"
 
 
 def _recount(root: Path) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 rows, videos.
 """
 
-import re
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -19,7 +18,6 @@ from manip_il.data.camera import open_video
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature, reading
 from manip_il.data.parquet_files import column_names, read_file
-from manip_il.errors import shorten
 
 _AXES = (
     ["height", "width", "channels"],
@@ -31,9 +29,6 @@ _TOLERANCES = {"min": 1e-5, "max": 1e-5, "mean": 1e-4, "std": 2e-3}  # shares of
 _OF_SPREAD = 0.05
 # a spread of less than this share of the largest value is lost in float32, so it is not compared
 _NOISE = 1e-5
-_TEMPORARY = re.compile(
-    r"\..*\.tmp|.*\.(partial|incomplete|ffconcat)|tmp[a-z0-9_]{8}|images|\.cache"
-)
 # largest difference in time between a video frame and its row that LeRobot's reader accepts [s]
 _LATE = 1e-4
 
@@ -64,11 +59,6 @@ class Finding:
 warning = partial(Finding, is_error=False)
 
 
-def journals_of(root: Path) -> Path:
-    """Return the folder next to a dataset that holds its journals; it may not exist."""
-    return root.absolute().with_name(f"{root.absolute().name}.journals")
-
-
 def of_episodes(
     root: Path, place: str, text: str, episodes: Collection[int], *, is_error: bool = False
 ) -> Finding:
@@ -94,22 +84,6 @@ def list_first(values: Collection[object]) -> str:
     """List the first three values and count the rest: `3, 7, 9 and 2 more`."""
     texts = [str(value) for value in values]
     return ", ".join(texts[:3]) + (f" and {len(texts) - 3:,} more" if len(texts) > 3 else "")
-
-
-def check_leftovers(dataset: Dataset) -> Iterator[Finding]:
-    """Check for leftovers of a recorder, writer or download that died."""
-    for path in leftovers(dataset.root):
-        yield warning(str(path), "left by a recorder, writer or download that died")
-
-
-def leftovers(root: Path) -> list[Path]:
-    """Return unneeded temporary files and folders in a dataset."""
-    named = [
-        path for path in [*root.iterdir(), *root.glob("meta/*")] if _TEMPORARY.fullmatch(path.name)
-    ]
-    return sorted(
-        path for path in named if any(file.is_file() for file in [path, *path.rglob("*")])
-    )
 
 
 def check_info(dataset: Dataset) -> Iterator[Finding]:
@@ -240,7 +214,7 @@ def check_frames(dataset: Dataset) -> Iterator[Finding]:
                 yield Finding(place, f"{lacking:,} of {len(cells):,} rows have no picture")
     for key, clips in table.clips.items():
         size = dataset.features[key].picture_size
-        for name in dict.fromkeys(clips.files):
+        for name in dict.fromkeys(file for file, _ in clips):
             with reading(root / name), closing(open_video(root / name, size)) as container:
                 [stream] = container.streams.video
                 tick = float(stream.time_base or 1)
@@ -249,33 +223,22 @@ def check_frames(dataset: Dataset) -> Iterator[Finding]:
             wanted = np.concatenate(
                 [
                     start + np.arange(length) / dataset.fps
-                    for file, start, length in zip(
-                        clips.files, clips.starts, table.length, strict=True
-                    )
+                    for (file, start), length in zip(clips, table.length, strict=True)
                     if file == name
                 ]
             )
             first, after = (np.searchsorted(times, wanted + late) for late in (-_LATE, _LATE))
             lacking = int((first == after).sum())
-            if lacking or len(times) != len(wanted):
+            if lacking:
                 frames = f"{len(times):,} frames for {len(wanted):,} rows"
                 yield Finding(name, f"{frames}; {lacking:,} rows have no frame at their time")
 
 
 def check_own(dataset: Dataset) -> Iterator[Finding]:
-    """Check our own columns and `meta/manip_il.json`: names and shapes."""
-    own, features = dataset.own, dataset.features
-    if own is None:
-        if {s.SIM_STATE, s.EXECUTED_ACTION} <= features.keys():
-            text = "is missing (LeRobot's tools drop it): robot, task and versions are unknown"
-            yield warning(layout.OURS, text, "copy it from the dataset that this one was made from")
-        return
-    there = {key: ([*feature.shape], feature.names) for key, feature in features.items()}
-    for key, feature in s.features(own.spec).items():
-        wanted = [*feature["shape"]], feature["names"]
-        if there.get(key) != wanted:
-            text = f"{key} is {shorten(wanted)}, but {layout.INFO} has {shorten(there.get(key))}"
-            yield Finding(layout.OURS, text)
+    """Check that a dataset with our columns has `meta/manip_il.json`."""
+    if dataset.own is None and {s.SIM_STATE, s.EXECUTED_ACTION} <= dataset.features.keys():
+        text = "is missing (LeRobot's tools drop it): robot, task and versions are unknown"
+        yield warning(layout.OURS, text, "copy it from the dataset that this one was made from")
 
 
-CHECKS = (check_leftovers, check_info, check_rows, check_numbers, check_frames, check_own)
+CHECKS = (check_info, check_rows, check_numbers, check_frames, check_own)

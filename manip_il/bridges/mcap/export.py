@@ -61,13 +61,15 @@ def export_dataset(dataset: Dataset, folder: Path) -> Iterator[Path]:
         episodes.index.tolist(), episodes.start, episodes.stop, strict=True
     ):
         times = foxglove.frame_times(stop - start, rate)
-        channels = {_TASK_TOPIC: foxglove.texts(TASK, texts[start:stop], times)}
+        channels: dict[str, foxglove.Channel] = {
+            _TASK_TOPIC: (foxglove.texts(TASK), texts[start:stop])
+        }
         for column in columns:
             key = column.key
             values = (
                 _pictures(cameras[key], start, stop) if key in cameras else table[key][start:stop]
             )
-            channels[_topic(key)] = _messages(column, values, times)
+            channels[_topic(key)] = _channel(column, values)
         path = folder / f"episode_{episode:06d}.mcap"
         with path.open("wb") as stream:
             writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
@@ -110,21 +112,20 @@ def _columns(info: Info) -> list[Feature]:
     return [column for column in columns if column.key not in INDEX_FEATURES]
 
 
-def _messages(column: Feature, values: Any, times: foxglove.Times) -> foxglove.Messages:
+def _channel(column: Feature, values: Any) -> foxglove.Channel:
     if column.dtype in PICTURES:
-        return foxglove.images(column.key, values, times)
+        return foxglove.images(column.key), values
     if column.dtype == TEXT:
-        return foxglove.texts(column.key, values.reshape(-1).tolist(), times)
-    values = values.reshape(len(times), -1)
+        return foxglove.texts(column.key), values.reshape(-1).tolist()
+    rows = values.reshape(len(values), -1).tolist()
     if _is_joints(column):
-        return foxglove.joint_states(column.labels, values, times)
+        return foxglove.joint_states(column.labels), rows
     unnamed = (
         [column.key]
         if column.size == 1
         else [f"{column.key}_{place}" for place in range(column.size)]
     )
-    labels = column.labels if column.names else unnamed  # as in LeRobot
-    return foxglove.scalars(labels, values.tolist())
+    return foxglove.scalars(column.labels if column.names else unnamed), rows  # as in LeRobot
 
 
 def _pictures(camera: Camera, start: int, stop: int) -> Iterator[foxglove.U8]:

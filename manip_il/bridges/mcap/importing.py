@@ -116,27 +116,23 @@ def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
     Raises `ManipError` naming file and topic if the file lacks something that the mapping names.
     """
     sources = mapping.sources
-    columns: dict[str, list[str]] = {}
-    for key, source in sources.items():
-        columns.setdefault(source.topic, []).append(key)
     found: dict[str, dict[int, Any]] = {key: {} for key in sources}
-    for topic, stamp, content in read_messages(path, columns):
-        for key in columns[topic]:  # if stamps are equal, the last message counts
-            where = f"{path}, topic {topic}, {key} at {stamp} ns"
-            found[key][stamp] = (
-                None if sources[key].is_camera else _value(where, sources[key], content)
+    for topic, stamp, content in read_messages(path, {one.topic for one in sources.values()}):
+        for key, source in sources.items():  # if stamps are equal, the last message counts
+            if source.topic == topic:
+                where = f"{path}, topic {topic}, {key} at {stamp} ns"
+                found[key][stamp] = None if source.is_camera else _value(where, source, content)
+    for key, source in sources.items():
+        if not found[key]:
+            raise ManipError(
+                f"{path} has no messages of {source.topic}; expected all topics of the mapping"
             )
-    stamps = {topic: np.array([*found[keys[0]]], np.int64) for topic, keys in columns.items()}
-    if missing := [topic for topic, times in stamps.items() if not len(times)]:
-        raise ManipError(
-            f"{path} has no messages of {missing[0]}; expected all topics of the mapping"
-        )
+    stamps = {key: np.array([*messages], np.int64) for key, messages in found.items()}
     times = _times(path, stamps, exact_rate(mapping.fps))
     rows: dict[str, Any] = {TASK: [mapping.task] * len(times)}
     for key, source in sources.items():
         where = f"{path}, topic {source.topic}, {key}"
-        own = stamps[source.topic]
-        chosen = own[pick(where, source, own, times)].tolist()
+        chosen = stamps[key][pick(where, source, stamps[key], times)].tolist()
         rows[key] = (
             read_pictures(path, source.topic, chosen)
             if source.is_camera
@@ -148,11 +144,12 @@ def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
 
 def _times(path: Path, stamps: dict[str, I64], rate: Fraction) -> I64:
     """Return the frames' times [ns], (T,), from the latest first stamp to the earliest last one."""
-    start, last = max((int(times[0]), topic) for topic, times in stamps.items())
-    end, first = min((int(times[-1]), topic) for topic, times in stamps.items())
+    start, last = max((int(times[0]), key) for key, times in stamps.items())
+    end, first = min((int(times[-1]), key) for key, times in stamps.items())
     if end < start:
-        late = f"{first} ends {(start - end) / NANOSECONDS:g} s before {last} starts"
-        raise ManipError(f"{path}: {late}; expected topics that overlap in time")
+        raise ManipError(
+            f"{path}: {first} ends before {last} starts; expected topics that overlap in time"
+        )
     count = math.ceil((end - start + 1) * rate / NANOSECONDS)
     return start + np.array(frame_times(count, rate), np.int64)
 

@@ -17,8 +17,8 @@ from typing import Any, Literal, override
 from fsspec.callbacks import Callback
 
 from manip_il import checks
-from manip_il.bridges.doctor.files import journals_of
 from manip_il.bridges.store.errors import RemoteError
+from manip_il.data.journal import journals_of
 from manip_il.data.lerobot_layout import INFO
 
 MANIFEST_FILE = "manip_il_manifest.json"

@@ -17,7 +17,6 @@ from tqdm import tqdm
 
 from manip_il import checks
 from manip_il.bridges.doctor.examine import examine_folder
-from manip_il.bridges.doctor.files import journals_of
 from manip_il.bridges.store.errors import RemoteError, explained
 from manip_il.bridges.store.hub import Hub
 from manip_il.bridges.store.manifest import (
@@ -36,6 +35,7 @@ from manip_il.bridges.store.objects import Objects
 from manip_il.data import atomic
 from manip_il.data.atomic import DATASET, EPISODES, POLICY, kind_of, output_of
 from manip_il.data.gate import check_arrived
+from manip_il.data.journal import journals_of
 from manip_il.data.lerobot_layout import INFO
 from manip_il.errors import ManipError, UsageError
 

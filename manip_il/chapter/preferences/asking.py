@@ -11,16 +11,15 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from manip_il.chapter.preferences.pairs import PREFERENCES, VERSION, Clips, Pairs
-from manip_il.collect.edits import EditSource, open_source, render_states
+from manip_il.collect.edits import open_source, render_states
 from manip_il.data import schema
+from manip_il.data.dataset import joined_columns
 from manip_il.evaluation.film import encode_mp4
-from manip_il.mdp import F64
 from manip_il.sim.config import FILM, CameraConfig
 from manip_il.worlds.table import env_spec
 
 SIDE = 240  # edge of a film [pixels]
 MOST_FPS = 10  # films play in real time; rendering a picture takes tens of milliseconds
-_CAMERA = "front"
 
 
 Films = list[list[bytes]]  # MP4s of each pair, left and right
@@ -43,23 +42,21 @@ def render_films(
         RenderError: If there is no off-screen OpenGL.
         ManipError: If the states of a source cannot be rendered.
     """
-    pairs = clips.pairs
     opened = [open_source(root, robot) for root in clips.roots]
-    states = [source.dataset.columns([schema.SIM_STATE])[schema.SIM_STATE] for source in opened]
-    every = -(-pairs.control_hz // MOST_FPS)
+    datasets = [source.dataset for source in opened]
+    states = joined_columns(datasets, [schema.SIM_STATE])[schema.SIM_STATE]
+    spec = env_spec(opened[0].env)
+    spec.require("drawn", "choose another robot")
+    camera = spec.default_cameras[0]
+    config = CameraConfig((camera,), SIDE, SIDE, FILM)
+    every = -(-clips.pairs.control_hz // MOST_FPS)
     found: Films = []
-    for number, pair in enumerate(pairs.pairs):
-        films: list[bytes] = []
-        for side, clip in enumerate(pair):
-            rows = clips.rows[number, side] - clips.offsets[clip.source]
-            films.append(
-                _film(
-                    opened[clip.source],
-                    states[clip.source][rows[::every]],
-                    pairs.control_hz // every,
-                )
-            )
-        found.append(films)
+    for pair, rows in zip(clips.pairs.pairs, clips.rows[:, :, ::every], strict=True):
+        shown = (
+            render_states(opened[clip.source].env, config, states[own])[schema.IMAGES + camera]
+            for clip, own in zip(pair, rows, strict=True)
+        )
+        found.append([encode_mp4(list(one), clips.pairs.control_hz // every) for one in shown])
         on_pair()
     return found
 
@@ -97,11 +94,3 @@ def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
         script=Markup(script),
         script_sha256=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii"),
     )
-
-
-def _film(source: EditSource, states: F64, fps: float) -> bytes:
-    spec = env_spec(source.env)
-    spec.require("drawn", "choose another robot")
-    camera = spec.default_cameras[0]
-    pictures = render_states(source.env, CameraConfig((camera,), SIDE, SIDE, FILM), states)
-    return encode_mp4(list(pictures[schema.IMAGES + camera]), fps)

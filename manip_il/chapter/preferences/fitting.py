@@ -51,21 +51,20 @@ class FittedReward:
         logits: R(left) - R(right) of every answer, by the network that held it out, (A,).
         epochs: Number of epochs that the networks were trained for.
         answered: Agreement with the answers that are not `equal`.
-        true: Agreement with true progress, without pairs that differ by less than `TIE`; None if
-            the datasets have no progress.
+        true: Agreement with true progress, without pairs that differ by less than `TIE`.
     """
 
     network: RewardNetwork
     logits: F64
     epochs: int
     answered: Proportion
-    true: Proportion | None
+    true: Proportion
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of `fit.json`."""
         return {
             "agreement_with_answers": _counts(self.answered),
-            "agreement_with_progress": None if self.true is None else _counts(self.true),
+            "agreement_with_progress": _counts(self.true),
             "epochs": self.epochs,
         }
 
@@ -94,7 +93,7 @@ def fit_answers(
         ManipError: If fewer pairs have answers than there are networks.
     """
     folds = deal(answers.pair, shape.members, seed)
-    inputs, sides = torch.from_numpy(clips.inputs), torch.from_numpy(clips.rows[answers.pair])
+    inputs, sides = torch.from_numpy(clips.data.inputs), torch.from_numpy(clips.rows[answers.pair])
     with threads(1):
         network = RewardNetwork(inputs.shape[1], shape)
         network.initialise(generator_of(seed, 0))
@@ -103,48 +102,35 @@ def fit_answers(
         network.std.copy_(features.std(0).clamp(min=1e-6))
         epochs = _train(network, inputs, sides, answers.better, folds, seed, on_epoch)
         with torch.no_grad():
-            logits = (
-                _logits(network, inputs, sides)
-                .numpy()[folds, np.arange(len(folds))]
-                .astype(np.float64)
-            )
+            every = _logits(network, inputs, sides).numpy().astype(np.float64)
+            logits = every[folds, np.arange(len(folds))]
             rewards = torch.cat([network.members(part).mean(0) for part in inputs.split(_ROWS)])
-            every = max(1, len(rewards) // _MOST_FRAMES)
-            low, high = torch.quantile(rewards[::every], torch.tensor(_RANGE)).tolist()
+            some = rewards[:: max(1, len(rewards) // _MOST_FRAMES)]
+            low, high = torch.quantile(some, torch.tensor(_RANGE)).tolist()
         network.low.fill_(low)
         network.high.fill_(max(high, low + 1e-6))
     right = (logits > 0) == (answers.better > 0.5)
-    difference, true = true_difference(clips), None
-    if difference is not None:
-        pairs, first = np.unique(answers.pair, return_index=True)
-        clear = np.abs(difference[pairs]) >= TIE
-        true = _proportion(((logits[first] > 0) == (difference[pairs] > 0))[clear])
-    return FittedReward(network, logits, epochs, _proportion(right[answers.better != 0.5]), true)
+    pairs, first = np.unique(answers.pair, return_index=True)
+    difference = true_difference(clips)[pairs]
+    true = ((logits[first] > 0) == (difference > 0))[np.abs(difference) >= TIE]
+    answered = _proportion(right[answers.better != 0.5])
+    return FittedReward(network, logits, epochs, answered, _proportion(true))
 
 
-def true_difference(clips: Clips) -> F64 | None:
-    """Return the mean true progress of each left clip minus that of the right one, (P,).
-
-    None without progress.
-    """
-    if clips.progress is None:
-        return None
-    means = clips.progress[clips.rows].mean(axis=-1)
+def true_difference(clips: Clips) -> F64:
+    """Return the mean true progress of each left clip minus that of the right one, (P,)."""
+    means = clips.data.progress[clips.rows].mean(axis=-1)
     return means[:, 0] - means[:, 1]
 
 
 def summary_lines(found: FittedReward, answers: Answers) -> list[str]:
     """Return a summary of the answers and the fit as plain lines."""
     given = f"{len(answers.better):,} answers about {len(set(answers.pair.tolist())):,} pairs"
-    lines = [
+    return [
         f"{given}, {answers.skipped:,} skipped",
         f"agreement with answers on held-out pairs: {found.answered}",
+        f"agreement with true progress on held-out pairs: {found.true} of {found.true.n:,}",
     ]
-    if found.true is not None:
-        lines.append(
-            f"agreement with true progress on held-out pairs: {found.true} of {found.true.n:,}"
-        )
-    return lines
 
 
 def deal(pair: I64, folds: int, seed: int) -> I64:

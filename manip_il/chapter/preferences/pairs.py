@@ -29,9 +29,9 @@ from manip_il import checks
 from manip_il.chapter.reward import LearnedReward
 from manip_il.data import schema
 from manip_il.data.build import dataset_sha256
-from manip_il.data.dataset import Dataset
+from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.lerobot_layout import EPISODE_INDEX
-from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import in_one_line
 from manip_il.learn.sources import check_same_sources
 from manip_il.mdp import F32, F64, I64, require_finite
@@ -44,9 +44,7 @@ _TRIES = 100  # attempts to draw a new pair
 FORMAT, VERSION = "manip_il pairs", 1
 _ROUNDS = "round_*/dataset"  # a run's datasets
 PREFERENCES = "manip_il preferences"  # format of an answers file
-ANSWERS = ("left", "right", "equal", "skip")
-LEFT, RIGHT, EQUAL, SKIP = ANSWERS
-BETTER = {LEFT: 1.0, RIGHT: 0.0, EQUAL: 0.5}  # probability that the left clip is better
+BETTER = {"left": 1.0, "right": 0.0, "equal": 0.5}  # probability that the left clip is better
 _ROUNDING = 1e-9  # returns that differ by less than this are equal
 
 
@@ -59,16 +57,15 @@ class Frames:
         inputs: Inputs of a reward, (N, n + k + n): state, environment state and the action as
             executed.
         episodes: Episode number of each frame, ascending, (N,).
-        progress: True progress at each frame, (N,); None if the dataset has no such column.
-        success: Whether the task is solved at each frame, (N,); None if the dataset has no such
-            column.
+        progress: True progress at each frame, (N,).
+        success: Whether the task is solved at each frame, (N,).
     """
 
     spec: EnvironmentSpec
     inputs: F32
     episodes: I64
-    progress: F64 | None = None
-    success: NDArray[np.bool_] | None = None
+    progress: F64
+    success: NDArray[np.bool_]
 
     @cached_property
     def firsts(self) -> I64:
@@ -81,37 +78,26 @@ class Frames:
         return np.diff(self.firsts, append=len(self.inputs))
 
 
-def read_frames(root: Path) -> Frames:
-    """Return the frames of a dataset.
+def read_frames(*sources: Dataset | Path) -> Frames:
+    """Return the frames of one or more datasets, whose episodes are numbered consecutively.
 
-    Raises `ManipError` if it lacks our columns or has non-finite numbers.
+    Raises `MismatchError` unless they have the same task and columns, and `ManipError` if one lacks
+    our columns or has non-finite numbers.
     """
-    dataset = Dataset.open(root)
-    spec, present = dataset.spec, list(dataset.features)
-    action = schema.EXECUTED_ACTION if schema.EXECUTED_ACTION in present else schema.ACTION
-    needed = [schema.STATE, schema.ENVIRONMENT_STATE, action]
-    more = [name for name in (schema.PROGRESS, schema.SUCCESS) if name in present]
-    table = dataset.columns([*needed, *more, EPISODE_INDEX])
-    for name in (*needed, *more):
-        require_finite(f"{root}, column {name}", table[name])
-    progress, success = table.get(schema.PROGRESS), table.get(schema.SUCCESS)
+    datasets = [one if isinstance(one, Dataset) else Dataset.open(one) for one in sources]
+    roots, specs = [one.root for one in datasets], [one.spec for one in datasets]
+    check_same_sources(dict(zip(roots, specs, strict=True)), pictures=False, language=False)
+    given = (schema.STATE, schema.ENVIRONMENT_STATE, schema.EXECUTED_ACTION)
+    table = joined_columns(datasets, [*given, schema.PROGRESS, schema.SUCCESS, EPISODE_INDEX])
+    for name, values in table.items():
+        require_finite(f"{', '.join(map(str, roots))}, column {name}", values)
     return Frames(
-        spec,
-        np.concatenate([table[name] for name in needed], axis=1, dtype=np.float32),
+        specs[0],
+        np.concatenate([table[name] for name in given], axis=1, dtype=np.float32),
         table[EPISODE_INDEX].astype(np.int64).ravel(),
-        None if progress is None else progress.astype(np.float64).ravel(),
-        None if success is None else success.astype(bool).ravel(),
+        table[schema.PROGRESS].astype(np.float64).ravel(),
+        table[schema.SUCCESS].astype(bool).ravel(),
     )
-
-
-def read_all(roots: Sequence[Path]) -> list[Frames]:
-    """Return the frames of datasets.
-
-    Raises `MismatchError` unless they have the same task and columns.
-    """
-    found = [read_frames(root) for root in roots]
-    check_same_sources(roots, [one.spec for one in found], pictures=False, language=False)
-    return found
 
 
 def find_datasets(folders: Sequence[Path]) -> list[Path]:
@@ -160,6 +146,8 @@ class Pairs:
     """Pairs of clips, left and right, of equal length, from datasets of one task.
 
     Attributes:
+        format: What the file is.
+        version: Version of its format.
         robot: Name of the robot.
         task: Name of the task.
         control_hz: Control steps per second.
@@ -171,6 +159,8 @@ class Pairs:
         pairs: The left and the right clip of each pair.
     """
 
+    format: str = FORMAT
+    version: int = VERSION
     robot: str
     task: str
     control_hz: float
@@ -190,16 +180,16 @@ class Pairs:
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of `pairs.json`; a clip is [source, episode, first frame]."""
-        return {"format": FORMAT, "version": VERSION, **asdict(self)}
+        return asdict(self)
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Pairs:
         """Return the pairs that `to_json` has written."""
-        pairs = tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"])
-        plain = {
-            name: data[name] for name in ("robot", "task", "control_hz", "clip", "seed", "chosen")
+        made: dict[str, Any] = {
+            "sources": tuple(Source(**one) for one in data["sources"]),
+            "pairs": tuple((Clip(*left), Clip(*right)) for left, right in data["pairs"]),
         }
-        return cls(**plain, sources=tuple(Source(**one) for one in data["sources"]), pairs=pairs)
+        return cls(**data | made)
 
     @classmethod
     def read(cls, path: Path) -> Pairs:
@@ -233,46 +223,22 @@ class Clips:
     Attributes:
         pairs: The pairs.
         roots: Folders of the datasets, in the order of `Pairs.sources`.
-        frames: Frames of each dataset, in the same order.
+        data: Frames of the datasets, in the same order.
     """
 
     pairs: Pairs
     roots: tuple[Path, ...]
-    frames: tuple[Frames, ...]
-
-    @cached_property
-    def offsets(self) -> I64:
-        """Row of each source's first frame in `inputs`, (S,)."""
-        return np.cumsum([0, *(len(one.inputs) for one in self.frames)])[:-1]
-
-    @cached_property
-    def inputs(self) -> F32:
-        """A reward's inputs for all frames, (N, d)."""
-        return np.concatenate([one.inputs for one in self.frames])
-
-    @cached_property
-    def progress(self) -> F64 | None:
-        """True progress of all frames, (N,); None if a source has none."""
-        found = [one.progress for one in self.frames]
-        return (
-            None
-            if any(one is None for one in found)
-            else np.concatenate([one for one in found if one is not None])
-        )
+    data: Frames
 
     @cached_property
     def rows(self) -> I64:
-        """Rows of `inputs` that hold the frames of the left and right clips, (P, 2, L)."""
+        """Rows of `data` that hold the frames of the left and right clips, (P, 2, L)."""
+        episodes = np.cumsum([0, *(source.episodes for source in self.pairs.sources)])
         begin = [
-            [
-                self.offsets[clip.source]
-                + self.frames[clip.source].firsts[clip.episode]
-                + clip.first
-                for clip in pair
-            ]
+            [self.data.firsts[episodes[clip.source] + clip.episode] + clip.first for clip in pair]
             for pair in self.pairs.pairs
         ]
-        return np.array(begin, np.int64).reshape(-1, 2, 1) + np.arange(self.pairs.clip)
+        return np.array(begin, np.int64)[:, :, None] + np.arange(self.pairs.clip)
 
 
 def join_pairs(given: Sequence[Pairs]) -> Pairs:
@@ -281,20 +247,16 @@ def join_pairs(given: Sequence[Pairs]) -> Pairs:
     Raises `MismatchError` if clip lengths differ.
     """
     first = given[0]
-    for other in given[1:]:
+    for other in given:
         if first.clip != other.clip:
-            raise MismatchError(
-                "clip length", "the first file of pairs", first.clip, "another", other.clip
-            )
+            raise MismatchError("clip length", "one file", first.clip, "another", other.clip)
     sources = tuple(dict.fromkeys(source for one in given for source in one.sources))
-    joined: list[tuple[Clip, Clip]] = []
-    for one in given:
-        place = [sources.index(source) for source in one.sources]
-        joined += [
-            (left._replace(source=place[left.source]), right._replace(source=place[right.source]))
-            for left, right in one.pairs
-        ]
-    return replace(first, sources=sources, pairs=tuple(joined))
+
+    def joined(clip: Clip, one: Pairs) -> Clip:
+        return clip._replace(source=sources.index(one.sources[clip.source]))
+
+    pairs = ((joined(a, one), joined(b, one)) for one in given for a, b in one.pairs)
+    return replace(first, sources=sources, pairs=tuple(pairs))
 
 
 def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
@@ -315,7 +277,7 @@ def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
                 f"the pairs' dataset {source.root} is not among the sources, or has changed since"
             )
     used = tuple(found[source.sha256] for source in pairs.sources)
-    return Clips(pairs, used, tuple(read_all(used)))
+    return Clips(pairs, used, read_frames(*used))
 
 
 def choose_pairs(
@@ -345,39 +307,36 @@ def choose_pairs(
 
     Raises:
         MismatchError: If datasets and reward do not all have the same task and columns.
-        ManipError: If no episode is as long as a clip, or there are too few different pairs.
+        ManipError: If there are too few different pairs of episodes as long as a clip.
     """
-    frames = tuple(read_all(roots))
-    longest = max(int(one.lengths.max()) for one in frames)
-    if longest < length:
-        raise ManipError(f"--clip is {length} control steps; the longest episode has {longest}")
-    if reward is not None:
-        reward.check_fits(str(roots[0]), frames[0].spec)
-    drawn = _draw(frames, length, count * (1 if reward is None else POOL), rng)
+    datasets = [Dataset.open(root) for root in roots]
+    data = read_frames(*datasets)
+    spec = data.spec
+    lengths = np.split(data.lengths, np.cumsum([one.info.episodes for one in datasets])[:-1])
+    drawn = _draw(lengths, length, count * (POOL if reward else 1), rng)
     if len(drawn) < count:
         raise ManipError(
             f"--count is {count}; only {len(drawn)} pairs of clips of {length} steps were found"
         )
-    spec = frames[0].spec
     made = Pairs(
         robot=spec.robot,
         task=spec.task,
         control_hz=spec.fps,
         clip=length,
         sources=tuple(
-            Source(str(root), dataset_sha256(root), len(one.firsts), len(one.inputs))
-            for root, one in zip(roots, frames, strict=True)
+            Source(str(one.root), dataset_sha256(one.root), one.info.episodes, len(one))
+            for one in datasets
         ),
         pairs=tuple(drawn),
         seed=seed,
     )
     if reward is not None:
-        spread = disagreement(Clips(made, tuple(roots), frames), reward.members)
+        reward.check_fits(str(roots[0]), spec)
+        spread = disagreement(Clips(made, tuple(roots), data), reward.members)
         kept = np.sort(np.argsort(-spread, kind="stable")[:count])
-        made = replace(
-            made, pairs=tuple(drawn[place] for place in kept), chosen="where rewards disagree"
-        )
-    return Clips(made, tuple(roots), frames)
+        pairs = tuple(drawn[place] for place in kept)
+        made = replace(made, pairs=pairs, chosen="where rewards disagree")
+    return Clips(made, tuple(roots), data)
 
 
 def disagreement(clips: Clips, members: Members) -> F64:
@@ -385,34 +344,38 @@ def disagreement(clips: Clips, members: Members) -> F64:
     per pair, (P,).
     """
     rows = clips.rows
-    rewards = members(clips.inputs[rows.reshape(-1)])
+    rewards = members(clips.data.inputs[rows.reshape(-1)])
     returns = rewards.reshape(len(rewards), *rows.shape).sum(-1)
     return expit(returns[:, :, 0] - returns[:, :, 1]).std(axis=0)
 
 
 def _draw(
-    frames: Sequence[Frames], length: int, count: int, rng: np.random.Generator
+    lengths: Sequence[I64], length: int, count: int, rng: np.random.Generator
 ) -> list[tuple[Clip, Clip]]:
-    """Distinct pairs of clips; all sources appear equally often.
+    """Distinct pairs of clips, given the length of each source's episodes; all sources appear
+    equally often.
 
     Both clips may be from one source.
     """
-    found = dict[tuple[Clip, Clip], None]()
-    sources = [number for number, one in enumerate(frames) if one.lengths.max() >= length]
+    found = dict[frozenset[Clip], tuple[Clip, Clip]]()
+    episodes = [np.flatnonzero(one >= length) for one in lengths]
+    sources = [number for number, long in enumerate(episodes) if len(long)]
+    if not sources:
+        return []
 
     def draw(source: int) -> Clip:
         """A clip of a source: a uniformly drawn episode, then a uniformly drawn first frame."""
-        lengths = frames[source].lengths
-        episode = int(rng.choice(np.flatnonzero(lengths >= length)))
-        return Clip(source, episode, int(rng.integers(0, int(lengths[episode]) - length + 1)))
+        episode = int(rng.choice(episodes[source]))
+        last = int(lengths[source][episode]) - length
+        return Clip(source, episode, int(rng.integers(0, last + 1)))
 
     for left, right in rng.permutation(np.resize(sources, 2 * count)).reshape(count, 2).tolist():
         for _ in range(_TRIES):
             pair = draw(left), draw(right)
-            if pair[0] != pair[1] and pair not in found and pair[::-1] not in found:
-                found[pair] = None
+            if (both := frozenset(pair)) not in found and len(both) == 2:
+                found[both] = pair
                 break
-    return list(found)
+    return list(found.values())
 
 
 @dataclass(frozen=True)
@@ -421,17 +384,13 @@ class Answer:
 
     Attributes:
         pair: Number of the pair.
-        answer: One of `ANSWERS`.
+        answer: `left`, `right`, `equal` or `skip`.
         when: Time in ISO 8601; None if a simulated teacher answered.
     """
 
     pair: int
     answer: str
     when: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.answer not in ANSWERS:
-            raise UnknownName(f"answer about pair {self.pair}:", self.answer, ANSWERS)
 
 
 @dataclass(frozen=True)
@@ -466,28 +425,23 @@ class Preferences:
         pairs.
         """
         found = read_file(path, PREFERENCES, cls.from_json)
-        place = next(
-            (number for number, one in enumerate(pairs) if one.sha256 == found.pairs), None
-        )
-        if place is None:
-            own = pairs[0].sha256
-            raise MismatchError(
-                "sha256 of the pairs", str(path), found.pairs[:12], "the file of pairs", own[:12]
-            )
-        before = sum(map(len, pairs[:place]))
-        return replace(
-            found, answers=tuple(replace(one, pair=before + one.pair) for one in found.answers)
-        )
+        known = [one.sha256 for one in pairs]
+        if found.pairs not in known:
+            what, given = "sha256 of the pairs", found.pairs[:12]
+            raise MismatchError(what, str(path), given, "the file of pairs", known[0][:12])
+        before = sum(map(len, pairs[: known.index(found.pairs)]))
+        moved = (replace(one, pair=before + one.pair) for one in found.answers)
+        return replace(found, answers=tuple(moved))
 
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """All answers except skips.
+    """All answers that are `left`, `right` or `equal`.
 
     Attributes:
         pair: Numbers of the pairs, (A,).
         better: The answers as numbers, see `BETTER`, (A,).
-        skipped: Number of `skip` answers.
+        skipped: Number of other answers.
     """
 
     pair: I64
@@ -501,7 +455,7 @@ def join_answers(given: Sequence[Preferences]) -> Answers:
     Two answers about one pair are two observations, even if they contradict each other.
     """
     every = [one for preferences in given for one in preferences.answers]
-    kept = [one for one in every if one.answer != SKIP]
+    kept = [one for one in every if one.answer in BETTER]
     return Answers(
         np.array([one.pair for one in kept], np.int64),
         np.array([BETTER[one.answer] for one in kept], np.float64),
@@ -530,43 +484,23 @@ class Teacher:
         `UsageError` for anything else.
         """
         name, _, number = text.partition(":")
-        if name not in TEACHERS:
-            raise UnknownName("teacher", name, TEACHERS)
-        field, default = TEACHERS[name]
         try:
+            parameter, default, most = TEACHERS[name]
             value = float(number or default)
-        except ValueError:
-            value = math.nan
-        if not 0 <= value <= (1 if field == "epsilon" else math.inf):
+            if not 0 <= value <= most:
+                raise ValueError
+        except (LookupError, ValueError):
             raise UsageError(
                 f"--teacher is {text!r}; expected perfect, boltzmann:TEMPERATURE or mistaken:SHARE"
-            )
-        return cls(text, **{field: value})
-
-    def answers(self, clips: Clips, rng: np.random.Generator) -> list[str]:
-        """Return the teacher's answer about every pair.
-
-        Raises `ManipError` if the sources have no true progress.
-        """
-        if clips.progress is None:
-            raise ManipError(
-                "the sources have no progress column, which teachers need; use manip-il reward ask"
-            )
-        returns = clips.progress[clips.rows].sum(-1)
-        difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
-        mistaken = rng.random(len(returns)) < self.epsilon
-        left = chance < expit(difference / self.temperature) if self.temperature else difference > 0
-        found = np.where(left != mistaken, LEFT, RIGHT)
-        if not self.temperature:
-            found[np.abs(difference) < _ROUNDING] = EQUAL
-        return found.tolist()
+            ) from None
+        return cls(text, **{parameter: value})
 
 
-# name -> the parameter that the number after the name sets, and its default
+# name -> the parameter that the number after the name sets, its default, and its largest value
 TEACHERS = {
-    "perfect": ("epsilon", 0.0),
-    "boltzmann": ("temperature", 1.0),
-    "mistaken": ("epsilon", 0.1),
+    "perfect": ("epsilon", 0.0, 0.0),
+    "boltzmann": ("temperature", 1.0, math.inf),
+    "mistaken": ("epsilon", 0.1, 1.0),
 }
 
 
@@ -575,11 +509,17 @@ def answer_pairs(teacher: Teacher, clips: Clips, rng: np.random.Generator) -> Pr
 
     Args:
         teacher: The teacher.
-        clips: The pairs, with datasets that have a progress column.
+        clips: The pairs and their frames.
         rng: Draws the teacher's choices and mistakes; the same state gives the same answers.
-
-    Raises:
-        ManipError: If a dataset has no progress column.
     """
-    answers = [Answer(number, one) for number, one in enumerate(teacher.answers(clips, rng))]
-    return Preferences(clips.pairs.sha256, f"teacher {teacher.name}", tuple(answers))
+    returns = clips.data.progress[clips.rows].sum(-1)
+    difference, chance = returns[:, 0] - returns[:, 1], rng.random(len(returns))
+    mistaken = rng.random(len(returns)) < teacher.epsilon
+    left = difference > 0
+    if teacher.temperature:
+        left = chance < expit(difference / teacher.temperature)
+    found = np.where(left != mistaken, "left", "right")
+    if not teacher.temperature:
+        found[np.abs(difference) < _ROUNDING] = "equal"
+    answers = tuple(Answer(number, one) for number, one in enumerate(found.tolist()))
+    return Preferences(clips.pairs.sha256, f"teacher {teacher.name}", answers)

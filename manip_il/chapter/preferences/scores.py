@@ -57,8 +57,12 @@ class Scores:
 
     @cached_property
     def episodes(self) -> F64:
-        """Score of each episode, (E,)."""
-        return episode_scores(self.frames, self.data)
+        """Score of each episode, the mean over its last `LAST` seconds, (E,)."""
+        last = max(1, round(LAST * self.data.spec.fps))
+        ends = self.data.firsts + self.data.lengths
+        begins = np.maximum(self.data.firsts, ends - last)
+        sums = np.concatenate([[0.0], np.cumsum(self.frames)])
+        return (sums[ends] - sums[begins]) / (ends - begins)
 
     @property
     def bar(self) -> float:
@@ -68,13 +72,8 @@ class Scores:
         return float(np.quantile(self.episodes, BEST)) - BELOW
 
     @property
-    def succeeded(self) -> NDArray[np.bool_] | None:
-        """Whether each episode succeeded at some step, (E,).
-
-        None if the dataset has no success column.
-        """
-        if self.data.success is None:
-            return None
+    def succeeded(self) -> NDArray[np.bool_]:
+        """Whether each episode succeeded at some step, (E,)."""
         return np.logical_or.reduceat(self.data.success, self.data.firsts)
 
     @property
@@ -95,7 +94,7 @@ class Scores:
                 "frames": int(self.data.lengths[place]),
                 "score": float(self.episodes[place]),
                 "kept": bool(self.episodes[place] > bar),
-                "success": None if succeeded is None else bool(succeeded[place]),
+                "success": bool(succeeded[place]),
             }
             for place, number in enumerate(numbers)
         ]
@@ -108,30 +107,19 @@ class Scores:
         }
 
 
-def episode_scores(values: F64, frames: Frames) -> F64:
-    """Return the mean of the frames' values (N,) over the last `LAST` seconds of each episode,
-    (E,).
-    """
-    last = max(1, round(LAST * frames.spec.fps))
-    ends = frames.firsts + frames.lengths
-    begins = np.maximum(frames.firsts, ends - last)
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    return (sums[ends] - sums[begins]) / (ends - begins)
-
-
-def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
+def roc_auc(scores: F64, succeeded: NDArray[np.bool_]) -> float | None:
     """Return P(a failed episode's score is below a successful one's).
 
     Ties count half (Mann and Whitney 1947).
 
     Args:
         scores: Scores of the episodes, (E,).
-        succeeded: Whether each episode succeeded, (E,); None if this is unknown.
+        succeeded: Whether each episode succeeded, (E,).
 
     Returns:
-        The probability; None if all or none of the episodes succeeded, or if this is unknown.
+        The probability; None if all or none of the episodes succeeded.
     """
-    if succeeded is None or succeeded.all() or not succeeded.any():
+    if succeeded.all() or not succeeded.any():
         return None
     good, bad = scores[succeeded], scores[~succeeded]
     found: Any = mannwhitneyu(good, bad, method="asymptotic")
@@ -169,7 +157,7 @@ def worst_table(scores: Scores) -> Table:
         (
             str(data.episodes[data.firsts[place]]),
             f"{scores.episodes[place]:.2f}",
-            "" if succeeded is None else ("yes" if succeeded[place] else "no"),
+            "yes" if succeeded[place] else "no",
             f"{data.lengths[place]:,}",
         )
         for place in np.argsort(scores.episodes, kind="stable")[:WORST].tolist()

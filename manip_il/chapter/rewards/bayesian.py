@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from manip_il.mdp import F64, I64
-from manip_il.tasks.carry.grid import Demonstration, add_rivals, rivals
+from manip_il.tasks.carry.grid import Demonstration, rivals
 
 Density = Callable[[F64], F64]  # log-densities (C,) at points (C, K)
 PRIOR = 300.0  # mean of a weight [1/m]
@@ -61,50 +61,23 @@ class Choices:
         return (least - np.log(sums)).sum(axis=0)
 
 
-@dataclass(frozen=True)
-class Posterior:
-    """Draws of the weights, (N, K) [1/m]."""
+def fit(demonstrations: Sequence[Demonstration], rng: np.random.Generator) -> F64:
+    """Return draws from the posterior of the weights, given the demonstrations, (N, K) [1/m].
 
-    draws: F64
-
-    @property
-    def mean(self) -> F64:
-        """Posterior mean of the weights, (K,) [1/m].
-
-        The cheapest path for the mean has the least expected cost.
-        """
-        return self.draws.mean(axis=0)
-
-    def ratios(self, base: int, level: float) -> F64:
-        """Return the credible intervals, (K, 2), of each weight's ratio to the weight of feature
-        `base`.
-        """
-        ratios = self.draws / self.draws[:, [base]]
-        return np.quantile(ratios, [(1 - level) / 2, (1 + level) / 2], axis=0).T
-
-    def thin(self, count: int) -> F64:
-        """Return evenly spaced draws, (count, K)."""
-        return self.draws[np.linspace(0, len(self.draws) - 1, count).round().astype(np.int64)]
-
-
-def fit(
-    demonstrations: Sequence[Demonstration], rng: np.random.Generator, prior: float = PRIOR
-) -> Posterior:
-    """Return the posterior of the weights, given the demonstrations.
-
-    Each demonstration is taken as chosen over the cheapest paths for sampled weights.
+    Each demonstration is taken as chosen over the cheapest paths for sampled weights. The cheapest
+    path for the mean of the draws has the least expected cost.
 
     Args:
         demonstrations: One or more demonstrations, with the same K features.
         rng: Draws the sampled weights and the posterior.
-        prior: Prior mean of a weight [1/m].
     """
     size = demonstrations[0].problem.features.shape[1]
-    sums = rivals(demonstrations, rng.exponential(prior, (TASTES, size)))
+    sums = rivals(demonstrations, rng.exponential(PRIOR, (TASTES, size)))
     for _ in range(_ROUNDS):
-        quick = draw_posterior(Choices.of(sums), rng, prior, _DRAWS // 5, _WARM_UP)
-        sums = add_rivals(demonstrations, sums, quick.thin(_MORE))
-    return draw_posterior(Choices.of(sums), rng, prior)
+        quick = draw_posterior(Choices.of(sums), rng, count=_DRAWS // 5)
+        even = np.linspace(0, len(quick) - 1, _MORE).round().astype(np.int64)
+        sums = rivals(demonstrations, quick[even], sums)
+    return draw_posterior(Choices.of(sums), rng)
 
 
 def draw_posterior(
@@ -112,8 +85,7 @@ def draw_posterior(
     rng: np.random.Generator,
     prior: float = PRIOR,
     count: int = _DRAWS,
-    warm_up: int = _WARM_UP,
-) -> Posterior:
+) -> F64:
     """Return draws of the weights given the choices.
 
     Args:
@@ -121,10 +93,9 @@ def draw_posterior(
         rng: Draws the starts of the chains and their steps.
         prior: Prior mean of a weight [1/m].
         count: Draws per chain.
-        warm_up: Steps of each warm-up; its second half tunes the steps that follow.
 
     Returns:
-        The draws of all `CHAINS` chains, one chain after the other.
+        The draws of all `CHAINS` chains, one chain after the other, (N, K) [1/m].
     """
 
     def density(logs: F64) -> F64:
@@ -135,12 +106,11 @@ def draw_posterior(
     size = choices.excess.shape[1]
     start, root = np.log(prior * rng.uniform(0.5, 1.5, (CHAINS, size))), _FIRST * np.eye(size)
     for _ in range(_FITS):
-        tried = sample(density, start, root, warm_up, rng)[:, warm_up // 2 :]
-        start, root = (
-            tried[:, -1],
-            _STEP / np.sqrt(size) * np.linalg.cholesky(np.cov(tried.reshape(-1, size).T)),
-        )
-    return Posterior(np.exp(sample(density, start, root, count, rng).reshape(-1, size)))
+        # the first half only leads there
+        tried = sample(density, start, root, _WARM_UP, rng)[:, _WARM_UP // 2 :]
+        start, spread = tried[:, -1], np.cov(tried.reshape(-1, size).T)
+        root = _STEP / np.sqrt(size) * np.linalg.cholesky(spread)
+    return np.exp(sample(density, start, root, count, rng).reshape(-1, size))
 
 
 def sample(density: Density, start: F64, root: F64, count: int, rng: np.random.Generator) -> F64:

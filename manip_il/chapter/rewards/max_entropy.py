@@ -51,10 +51,8 @@ class SoftPlan:
         """Return the expected number of visits to each edge from node `start` on, (E,) (Ziebart et
         al. 2008, alg. 1).
 
-        Raises `ManipError` if no path leads to the goal.
+        Raises `ManipError` if very long paths are likely.
         """
-        if not np.isfinite(self.values[start]):
-            raise ManipError(f"no path leads from node {start} to the goal")
         moves = self.problem.matrix(self.chances).T.tocsr()
         now = np.zeros(self.problem.nodes)
         now[start] = 1.0
@@ -81,7 +79,7 @@ def soft_plan(problem: PathProblem, weights: F64) -> SoftPlan:
     Raises `ManipError` if the sum over all paths is infinite, because their number grows faster
     than exp(cost) (the spectral radius of the module's M is 1 or more).
     """
-    costs, edges = problem.costs(weights), problem.edges
+    costs, edges = problem.features @ weights, problem.edges
     hard = plan(problem, weights).costs
     known = np.where(np.isfinite(hard), hard, 0.0)
     leads = np.isfinite(hard)[edges[:, 1]] & (edges[:, 0] != problem.goal)
@@ -154,24 +152,20 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
     return found
 
 
-def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> F64:
+def fit(demonstrations: Sequence[Demonstration]) -> F64:
     """Return the most likely weights (K,) [1/m], each 0 or more, by L-BFGS-B.
 
     The search starts from weights above `least_weights`. It fits some of the demonstrations first,
     then all of them.
-
-    Args:
-        demonstrations: One or more demonstrations.
-        prior: Standard deviation of the weights' normal prior [1/m].
     """
     least = least_weights(demonstrations)
     weights = np.maximum(2 * least, least.max() / 2)
     for some in stages(demonstrations):
-        weights = _minimise(some, weights, least, prior)
+        weights = _minimise(some, weights, least)
     return weights
 
 
-def _minimise(demonstrations: Sequence[Demonstration], start: F64, least: F64, prior: float) -> F64:
+def _minimise(demonstrations: Sequence[Demonstration], start: F64, least: F64) -> F64:
     """The most likely weights (K,).
 
     The optimiser scales each by its feature's initial deviation.
@@ -183,7 +177,7 @@ def _minimise(demonstrations: Sequence[Demonstration], start: F64, least: F64, p
     units = (units / max(float(units.max()), _TINY)).clip(min=_LEAST_UNIT)
 
     def loss(scaled: F64) -> tuple[float, F64]:
-        value, gradient = loss_of(demonstrations, scaled / units, prior)
+        value, gradient = loss_of(demonstrations, scaled / units)
         return value, gradient / units
 
     options: Any = {"maxiter": _MOST_STEPS, "gtol": _GRADIENT_TOLERANCE, "ftol": _LOSS_TOLERANCE}

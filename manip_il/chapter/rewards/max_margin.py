@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from manip_il.mdp import F64
-from manip_il.tasks.carry.grid import LENGTH, Demonstration, cheapest_path, plan_edges, stages
+from manip_il.tasks.carry.grid import LENGTH, Demonstration, plan, stages
 
 MARGIN = 0.05  # margin per metre of path off the demonstration
 RIDGE = 1e-4  # factor of the penalty, half the squared weights
@@ -20,19 +20,16 @@ _RATE = 1.0  # AdaGrad's learning rate, the size of each weight's first step
 _EPSILON = 1e-12
 
 
-def loss_of(
-    demonstration: Demonstration, weights: F64, margin: float = MARGIN
-) -> tuple[float, F64]:
+def loss_of(demonstration: Demonstration, weights: F64) -> tuple[float, F64]:
     """Return the margin violation of a demonstration and a subgradient.
 
-    The margin of a path is `margin` times the length of its edges that end off the demonstration
+    The margin of a path is `MARGIN` times the length of its edges that end off the demonstration
     (Ratliff et al. 2006, with the maximum over paths as in their eq. 7).
 
     Args:
         demonstration: The demonstration.
         weights: The weights, (K,). Costs minus margins are positive if length's weight is 1 or
             more.
-        margin: Margin per metre of path off the demonstration.
 
     Returns:
         How much the demonstration costs above the cheapest path after margins are subtracted, and a
@@ -44,16 +41,16 @@ def loss_of(
     problem = demonstration.problem
     off = np.ones(problem.nodes, bool)
     off[demonstration.path] = False
-    loss = margin * problem.features[:, LENGTH] * off[problem.edges[:, 1]]
-    planned = plan_edges(problem, problem.costs(weights) - loss)
-    _, sums = cheapest_path(problem, planned, demonstration.start)
+    loss = MARGIN * problem.features[:, LENGTH] * off[problem.edges[:, 1]]
+    planned = plan(problem, weights, loss)
+    _, sums = planned.path(demonstration.start)
     return (
         float(demonstration.sums @ weights - planned.costs[demonstration.start]),
         demonstration.sums - sums,
     )
 
 
-def fit(demonstrations: Sequence[Demonstration], margin: float = MARGIN) -> F64:
+def fit(demonstrations: Sequence[Demonstration]) -> F64:
     """Return the weights (K,) of maximum margin planning: the mean over the second half of
     projected subgradient steps.
 
@@ -65,10 +62,7 @@ def fit(demonstrations: Sequence[Demonstration], margin: float = MARGIN) -> F64:
     for some in stages(demonstrations):
         squares, kept = np.zeros_like(least), list[F64]()
         for _ in range(_STEPS):
-            gradient = (
-                np.mean([loss_of(one, weights, margin)[1] for one in some], axis=0)
-                + RIDGE * weights
-            )
+            gradient = np.mean([loss_of(one, weights)[1] for one in some], axis=0) + RIDGE * weights
             squares += gradient**2
             weights = np.maximum(weights - _RATE * gradient / np.sqrt(squares + _EPSILON), least)
             kept.append(weights)

@@ -199,14 +199,7 @@ class LossCurve:
     def to_json(self) -> dict[str, Any]:
         """Return the curve as JSON."""
         losses = {name: getattr(self, name).tolist() for name in ("errors", "gaps", "bounds")}
-        found = {"slope": self.slope, "above": self.above}
-        return {
-            "problem": self.problem,
-            "learner": self.learner,
-            "horizons": self.horizons,
-            **losses,
-            **found,
-        }
+        return vars(self) | losses | {"slope": self.slope, "above": self.above}
 
 
 def curves(

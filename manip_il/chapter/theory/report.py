@@ -16,7 +16,7 @@ from manip_il.evaluation.tables import Table
 
 FILE_NAME = "theory.json"
 _LOOKS = {"cloning": (CLONING, "o"), "DAgger": (DAGGER, "s")}
-_LEAST = 1e-7  # smallest distance on the logarithmic axis
+_RANGE = (1e-7, 100)  # of the distances on the logarithmic axis
 _POINTS = 1_500  # most points per cloud
 _DATA = "#b9bfc6"
 
@@ -55,20 +55,11 @@ def slope_table(theory: Theory) -> Table:
     process.
     """
     rows = []
-    for process, cloned, improved in zip(
-        PROCESSES, theory.curves[::2], theory.curves[1::2], strict=True
-    ):
-        last = cloned.horizons[-1]
+    for process, *own in zip(PROCESSES, theory.curves[::2], theory.curves[1::2], strict=True):
+        last = own[0].horizons[-1]
         u = f"{process.recoverability(last):g} at H = {last}"
-        rows.append(
-            (
-                process.name,
-                u,
-                *map(str, process.slopes),
-                f"{cloned.slope:.2f}",
-                f"{improved.slope:.2f}",
-            )
-        )
+        slopes = (f"{curve.slope:.2f}" for curve in own)
+        rows.append((process.name, u, *map(str, process.slopes), *slopes))
     return Table(
         ("process", "recoverability u", "cloning, theorem", "DAgger, theorem", "cloning", "DAgger"),
         tuple(rows),
@@ -140,22 +131,12 @@ def _theorem_figure(curves: Sequence[LossCurve]) -> Figure:
     bounds.
     """
     with drawing(len(PROCESSES), size=(3.2, 3.0)) as (drawn, axes):
-        for axis, process, *own in zip(axes[0], PROCESSES, curves[::2], curves[1::2], strict=True):
-            for curve in own:
-                colour, marker = _LOOKS[curve.learner]
-                axis.plot(
-                    curve.horizons, curve.ratios, marker, color=colour, ms=4.5, label=curve.learner
-                )
-                bounds = curve.bounds.mean(axis=1) / curve.errors.mean(axis=1)
-                axis.plot(
-                    curve.horizons,
-                    bounds,
-                    ":",
-                    color=colour,
-                    lw=1.2,
-                    label=f"bound, {curve.learner}",
-                )
-            axis.set(xscale="log", yscale="log", xlabel="horizon H", title=process.name)
+        for curve, axis in zip(curves, np.repeat(axes[0], 2), strict=True):
+            colour, marker = _LOOKS[curve.learner]
+            bounds = curve.bounds.mean(axis=1) / curve.errors.mean(axis=1)
+            axis.plot(curve.horizons, curve.ratios, marker, color=colour, label=curve.learner)
+            axis.plot(curve.horizons, bounds, ":", color=colour, label=f"bound, {curve.learner}")
+            axis.set(xscale="log", yscale="log", xlabel="horizon H", title=curve.problem)
         axes[0, 0].set_ylabel("gap / ε")
         drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
         return to_figure(
@@ -192,20 +173,15 @@ def _linear_figure(drifts: Sequence[Drift]) -> Figure:
     with drawing(1, size=(5.4, 4.4)) as (drawn, axes):
         [[axis]] = axes
         for drift in drifts:
-            name, noise = OPEN_LOOPS[drift.pole], ", noisy" if drift.noise else ""
             label = (
-                f"{name}, a = {drift.pole:g}{noise}: error {drift.error:.1e}, growth"
-                f" {drift.growth:.2f}"
+                f"{OPEN_LOOPS[drift.pole]}, a = {drift.pole:g}{', noisy' if drift.noise else ''}:"
+                f" error {drift.error:.1e}, growth {drift.growth:.2f}"
             )
-            look = {
-                "color": COLOURS[list(OPEN_LOOPS).index(drift.pole)],
-                "ls": "--" if noise else "-",
-            }
-            axis.plot(
-                range(1, len(drift.apart) + 1), np.maximum(drift.apart, _LEAST), label=label, **look
-            )
-        axis.axhline(GUST, color=SOFT, lw=0.8, ls=":")
-        axis.set(yscale="log", xlabel="step", ylabel="distance from the expert", ylim=(_LEAST, 100))
+            colour = COLOURS[list(OPEN_LOOPS).index(drift.pole)]
+            steps, line = range(1, len(drift.apart) + 1), "--" if drift.noise else "-"
+            axis.plot(steps, drift.apart, line, color=colour, label=label)
+        axis.axhline(GUST, color=SOFT, ls=":")
+        axis.set(yscale="log", xlabel="step", ylabel="distance from the expert", ylim=_RANGE)
         drawn.legend(*axis.get_legend_handles_labels(), loc="outside lower center")
         return to_figure(
             drawn,
@@ -263,14 +239,11 @@ def _clouds_figure(rounds: Sequence[RoundShift]) -> Figure:
         axes,
     ):
         for axis, one in zip(axes[0], shown, strict=True):
-            for places, colour in (
-                (one.data, _DATA),
-                (one.hand, CLONING if one.round == 0 else DAGGER),
-            ):
+            own = CLONING if one.round == 0 else DAGGER
+            for places, colour in ((one.data, _DATA), (one.hand, own)):
                 x, y, _ = places[:: max(1, len(places) // _POINTS)].T
                 axis.scatter(y, x, s=2.5, color=colour, alpha=0.55, lw=0, rasterized=True)
-            axis.set(title=one.name, xlabel="y [m]", ylabel="x [m]")
-            axis.set_aspect("equal", adjustable="box")
+            axis.set(title=one.name, xlabel="y [m]", ylabel="x [m]", aspect="equal")
         axes[0, 0].invert_xaxis()
         return to_figure(
             drawn, "Positions of the hand in the data and in the policy's rollouts, by round"

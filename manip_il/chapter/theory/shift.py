@@ -123,11 +123,10 @@ def find_rounds(run: Path) -> list[RoundData]:
     """
     found, datasets = list[RoundData](), list[Path]()
     for folder in sorted(run.glob("round_[0-9][0-9][0-9]")):
-        if (folder / "dataset" / "meta" / "info.json").is_file():
-            datasets.append(folder / "dataset")
-        policy = folder / "policy" / "checkpoints" / "last" / "pretrained_model"
-        if (policy / "config.json").is_file() and datasets:
-            found.append((int(folder.name[-3:]), policy, tuple(datasets)))
+        datasets += folder.glob("dataset")
+        for policy in folder.glob("policy/checkpoints/last/pretrained_model"):
+            if datasets:
+                found.append((int(folder.name[-3:]), policy, tuple(datasets)))
     if not found:
         raise ManipError(
             f"{run} has no round with a policy; expected the folder of a run of manip-il dagger"

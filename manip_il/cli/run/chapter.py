@@ -3,8 +3,12 @@
 Run `manip-il reward irl`: learn a reward from demonstrations.
 
 Run `manip-il data score`: score a dataset's episodes by a reward.
+
+Run `manip-il theory`: the proven bounds of cloning and DAgger, on small MDPs and on the rounds of a
+run.
 """
 
+from itertools import chain
 from pathlib import Path
 
 from manip_il.chapter import inverse
@@ -25,13 +29,25 @@ from manip_il.chapter.preferences.pairs import (
     read_frames,
 )
 from manip_il.chapter.reward import LearnedReward, shape_for, write_reward
-from manip_il.cli.chapter import AnswerOptions, AskOptions, FitOptions, IrlOptions, PairsOptions
+from manip_il.chapter.theory.bounds import PROCESSES, curves
+from manip_il.chapter.theory.linear import drifts
+from manip_il.chapter.theory.report import FILE_NAME, Theory, slope_table, theory_report
+from manip_il.chapter.theory.shift import RoundData, Shift, find_rounds, measure_shift
+from manip_il.cli.chapter import (
+    AnswerOptions,
+    AskOptions,
+    FitOptions,
+    IrlOptions,
+    PairsOptions,
+    TheoryOptions,
+)
 from manip_il.cli.data import ScoreOptions
 from manip_il.cli.outputs import publish
 from manip_il.cli.progress import progress, say
 from manip_il.data.atomic import write_file, write_json
 from manip_il.data.dataset import Dataset
-from manip_il.errors import ManipError
+from manip_il.evaluation.certify import certify, count_episodes
+from manip_il.evaluation.side import read_member
 from manip_il.learn.checkpoint import find_policy
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.seeding import rng_for, stream_base
@@ -55,7 +71,7 @@ def run_ask(options: AskOptions) -> None:
     clips = read_clips(Pairs.read(options.pairs), find_datasets(options.sources))
     with progress(len(clips.pairs), "render") as bar:
         films = render_films(clips, options.robot, bar.step)
-    page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
+    page = render_page(clips.pairs, clips.data.spec.instruction, films)
     write_file(options.output, page.encode())
     say(f"{len(clips.pairs):,} pairs: {options.output}")
 
@@ -76,14 +92,14 @@ def run_fit(options: FitOptions) -> None:
     answers = join_answers([Preferences.read(path, pairs) for path in options.answers])
     clips = read_clips(join_pairs(pairs), find_datasets(options.sources))
     with progress(None, f"fit {len(answers.better):,} answers") as bar:
-        shape = shape_for(clips.frames[0].spec, options.members)
+        shape = shape_for(clips.data.spec, options.members)
         found = fit_answers(clips, answers, shape, stream_base("training", options.seed), bar.step)
     fingerprint = Dataset.open(clips.roots[0]).fingerprint
     stored = {"seed": options.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.clip}
     with options.open() as folder:
         target = folder / PRETRAINED_MODEL
         target.mkdir(parents=True, exist_ok=True)
-        write_reward(target, found.network, clips.frames[0].spec, stored, fingerprint)
+        write_reward(target, found.network, clips.data.spec, stored, fingerprint)
         write_json(folder / "fit.json", found.to_json())
     say(*summary_lines(found, answers), f"reward: {folder}")
 
@@ -112,16 +128,44 @@ PROGRESS = "progress"  # value of --reward: score by true progress
 def run_score(options: ScoreOptions) -> None:
     """Score, print the worst episodes, write the files."""
     data = read_frames(options.dataset)
-    if options.reward != PROGRESS:
+    if options.reward == PROGRESS:
+        found = data.progress
+    else:
         reward = LearnedReward.load(find_policy(Path(options.reward).expanduser()))
         reward.check_fits(str(options.dataset), data.spec)
         found = reward(data.inputs).astype("float64").clip(0.0, 1.0)
-    elif data.progress is not None:
-        found = data.progress
-    else:
-        raise ManipError(f"{options.dataset} has no progress column; give --reward=FOLDER")
     scores = scoring.Scores(str(options.dataset), options.reward, data, found)
-    with options.open(Path(options.reward).expanduser()) as folder:
+    with options.open() as folder:
         scoring.write_weights(folder / scoring.WEIGHTS_FILE, scores)
         worst = [scoring.worst_table(scores)]
         publish(folder / scoring.FILE_NAME, scores.to_json(), worst, *scoring.fact_lines(scores))
+
+
+def run_theory(options: TheoryOptions) -> None:
+    """Compute and measure; write the report and the JSON file; print the slopes."""
+    rounds = find_rounds(options.source) if options.source else []
+    with options.open() as folder:
+        shift = _shift(options, options.source, rounds) if options.source else None
+        theory = Theory(tuple(chain(*map(curves, PROCESSES))), tuple(drifts()), shift)
+        page = theory_report(theory)
+        fact = f"policies above their bound: {theory.above}"
+        publish(
+            folder / FILE_NAME,
+            theory.to_json(),
+            [slope_table(theory)],
+            fact,
+            page=page,
+            options=options,
+        )
+
+
+def _shift(options: TheoryOptions, run: Path, rounds: list[RoundData]) -> Shift:
+    validation = read_member(run).validation
+    env = validation.env()
+    count = count_episodes(env, options.cases) + options.episodes * (1 + len(rounds))
+    with progress(count, f"theory {run}") as bar, options.open_engine() as engine:
+        certificate = certify(engine, env, options.cases, on_episode=lambda _: bar.step())
+        u, conditions = certificate.mu or 0, validation.settings.conditions
+        return measure_shift(
+            engine, env, rounds, u, options.episodes, lambda _: bar.step(), conditions
+        )

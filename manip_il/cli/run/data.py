@@ -157,10 +157,13 @@ def _conclude(options: CheckOptions, findings: list[Finding], remedy: str) -> No
 def run_repair(options: RepairOptions) -> None:
     """Check, repair, check again, and print the verdict; raises `ManipError` if errors remain."""
     if findings := _examine(options):
-        say(*(f"repair   {line}" for line in repair(options.dataset.absolute(), findings)))
+        say(*(f"repair   {line}" for line in repair(options.dataset.absolute())))
         findings = _examine(options)
     _conclude(
-        options, findings, "these cannot be repaired from what is here: pull or record it again"
+        options,
+        findings,
+        "these cannot be repaired: build it from its journals (manip-il data build), or pull or"
+        " record it again",
     )
 
 

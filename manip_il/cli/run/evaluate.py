@@ -5,7 +5,7 @@ import tempfile
 from pathlib import Path
 
 from manip_il.cli.evaluate import EvalOptions
-from manip_il.cli.outputs import REPORT_FILE, OutputFile, about, publish
+from manip_il.cli.outputs import OutputFile, about, publish
 from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.collect.inputs import path_options
 from manip_il.collect.workers import default_workers
@@ -15,6 +15,7 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.eval_report import condition_sides, eval_report, success_table
 from manip_il.evaluation.film import film_episode
 from manip_il.evaluation.measuring import evaluate, replay
+from manip_il.evaluation.report import REPORT_FILE
 from manip_il.evaluation.results import FILE_NAME, EvalResult, merge_results
 from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, CameraConfig

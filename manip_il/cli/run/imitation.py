@@ -7,7 +7,7 @@ Run `manip-il compare`: two policies or runs on the same seeds, or a study.
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,22 +19,21 @@ from manip_il.algorithms.run import Run
 from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.evaluate import CompareOptions, ComparisonOptions, StudyFile
 from manip_il.cli.imitation import DaggerOptions, DemoOptions
-from manip_il.cli.outputs import REPORT_FILE, about, publish
+from manip_il.cli.outputs import about, publish
 from manip_il.cli.parsing import Open, from_layers, from_yaml
 from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.collect.inputs import env_config, path_options
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import parse_query
 from manip_il.collect.workers import Engine
-from manip_il.data.atomic import read_lines
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.evaluation.comparison import FILE_NAME, Comparison, Study
 from manip_il.evaluation.eval_report import compare_report, run_report, success_table
 from manip_il.evaluation.film import collect_films, film_episode, run_states
 from manip_il.evaluation.measuring import measure_sides, open_driver
-from manip_il.evaluation.report import Film
-from manip_il.evaluation.rounds import METRICS_FILE, Rule
+from manip_il.evaluation.report import REPORT_FILE, Film
+from manip_il.evaluation.rounds import Rule
 from manip_il.evaluation.runner import episode_hold
 from manip_il.evaluation.side import (
     Member,
@@ -47,8 +46,10 @@ from manip_il.evaluation.side import (
 )
 from manip_il.evaluation.suites import varied
 from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
-from manip_il.learn.checkpoint import Checkpoint, with_folder
+from manip_il.learn.checkpoint import Checkpoint, policy_folder
 from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.names import MLP
+from manip_il.learn.network import NetworkConfig
 from manip_il.worlds.config import EnvConfig
 
 
@@ -64,12 +65,12 @@ def run_dagger(options: DaggerOptions) -> None:
         results = dagger(folder, config, workers=engine, progress=stages)
         kind = ALGORITHMS[config.method]
         page = validation_report(
+            folder,
             f"{kind} on {config.env.robot} {config.env.task}",
             "cloning" if config.start is None else "the policy given",
             {result.number: result.validation for result in results},
-            read_lines(folder / METRICS_FILE),
         )
-        replace(page, **about(options)).write(folder / REPORT_FILE)
+        replace(page, **about(options)).write(folder)
     if (folder / "dataset").is_dir():
         say(f"labels of all rounds as one dataset: {folder / 'dataset'}")
     say_best(folder, path_options(vars(config.env)))
@@ -89,7 +90,7 @@ def say_best(folder: Path, words: Sequence[str] = ()) -> None:
 
 def dagger_config(options: DaggerOptions) -> RunConfig:
     """Return the configuration of the run; raises if options contradict each other."""
-    policy, start = round_policy(with_folder(options.fit.get("policy", {})))
+    policy, start = round_policy(options.fit.get("policy", {}))
     observation, env = options.fit.get("observation"), env_config(options.env)
     sees = policy.get("type") == "cnn" and observation != "state"
     cameras = options.camera_config(env) if options.cameras or sees else None
@@ -118,13 +119,14 @@ def round_policy(settings: Open) -> tuple[Open, Checkpoint | None]:
     """
     if "path" not in settings:
         return settings, None
-    start = Checkpoint.open(Path(settings["path"]))
-    if (options := start.mlp_options) is None:
+    start = Checkpoint.open(policy_folder(settings["path"]))
+    if start.kind != MLP:
         return settings, start
     if "type" in settings:
         raise UsageError(
             "give one of --policy.path=DIR and --policy.type=...: the checkpoint sets the type"
         )
+    options = {"type": MLP} | asdict(NetworkConfig.of(start.config))
     return options | {name: value for name, value in settings.items() if name != "path"}, start
 
 
@@ -160,10 +162,9 @@ def run_demo(options: DemoOptions) -> None:
         fingerprint=sides[-1].results[0].fingerprint,
         **about(options),
     )
-    page.write(folder / REPORT_FILE)
+    path = page.write(folder)
     success_table(sides).print()
-    say(verdict, *facts)
-    say(f"report: {folder / REPORT_FILE}")
+    say(verdict, *facts, f"report: {path}")
     say_next(
         "eval",
         f"--policy.path={sides[-1].members[0].policy}",
@@ -194,10 +195,11 @@ def _measure(
         Side(name, (Member(Path(name), policy=path),), colour, n)
         for name, path, n, colour in contestants
     ]
+    envs = dict.fromkeys((side.name for side in sides), config.env)
     nominal, disturbed = (
         measure_sides(
             sides,
-            {side.name: config.env for side in sides},
+            envs,
             folder / suite,
             episodes=count,
             suite=suite,
@@ -271,7 +273,7 @@ def _refuse(options: CompareOptions, why: str, *names: str) -> None:
 
 def _run_study(options: CompareOptions, path: Path) -> None:
     plan = read_plan(path, options.training_seeds, options.trust)
-    with options.open(path, saved=plan.file) as folder:
+    with options.open(plan.file) as folder:
         run_plan(plan, folder, options)
         sides = [read_side(folder / name, name) for name in plan.arms]
         title = f"Study: {path.stem}"

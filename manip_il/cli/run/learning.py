@@ -10,15 +10,12 @@ from manip_il.chapter.config import LearningConfig
 from manip_il.chapter.learning import LearningRun
 from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.chapter import GailOptions, Learning, PpoOptions
-from manip_il.cli.outputs import REPORT_FILE, about
+from manip_il.cli.outputs import about
 from manip_il.cli.progress import Stages, say
 from manip_il.cli.run.imitation import say_best
 from manip_il.collect.inputs import open_dataset
-from manip_il.data.atomic import read_lines
-from manip_il.evaluation.rounds import METRICS_FILE
 from manip_il.learn.checkpoint import Origin, find_policy
 from manip_il.learn.sources import check_same_sources
-from manip_il.progress import Progress
 from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.worlds.table import env_spec, stored_config
 
@@ -28,18 +25,14 @@ def _run(options: Learning, config: LearningConfig) -> None:
     with options.open() as folder:
         kept = f"every finished iteration, in {folder}"
         with Stages(kept) as stages, options.open_engine() as engine:
-            watch = Progress()
-            vars(watch).update(dict.fromkeys(("episode", "step"), lambda *_: stages.check()))
             stages.start(f"{options.method.upper()}, steps", config.steps)
-            for result in LearningRun(config, folder, engine, watch).results():
+            for result in LearningRun(config, folder, engine).results():
                 stages.log({"step": result.steps} | result.metrics)
                 if result.validated is not None:
                     say(f"{result.steps:,} steps: validation success {result.validated.success}")
         title = f"{options.method.upper()} on {config.env.robot} {config.env.task}"
-        page = validation_report(
-            title, "initial policy", validations(folder), read_lines(folder / METRICS_FILE)
-        )
-        replace(page, **about(options)).write(folder / REPORT_FILE)
+        page = validation_report(folder, title, "initial policy", validations(folder))
+        replace(page, **about(options)).write(folder)
     say_best(folder)
 
 
@@ -80,6 +73,8 @@ def imitation_config(options: GailOptions) -> LearningConfig:
     Raises if the demonstrations are not of one known environment.
     """
     roots = options.dataset.root
-    specs = [open_dataset(root).spec for root in roots]
-    check_same_sources(roots, specs, pictures=False, language=False)
-    return _config(options, specs[0], datasets=tuple(roots), discriminator=options.discriminator)
+    specs = {root: open_dataset(root).spec for root in roots}
+    check_same_sources(specs, pictures=False, language=False)
+    return _config(
+        options, specs[roots[0]], datasets=tuple(roots), discriminator=options.discriminator
+    )

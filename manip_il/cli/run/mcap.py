@@ -10,7 +10,7 @@ from manip_il.data.atomic import new_folder, output_of
 from manip_il.data.dataset import Dataset
 
 
-def run_mcap_export(options: McapExportOptions) -> None:
+def run_to_mcap(options: McapExportOptions) -> None:
     """Export every episode; the folder appears when it is complete."""
     dataset = Dataset.open(options.dataset)
     prepare_output(
@@ -27,7 +27,7 @@ def run_mcap_export(options: McapExportOptions) -> None:
     say(f"exported {dataset.info.episodes:,} episodes to {options.out}")
 
 
-def run_mcap_import(options: McapImportOptions) -> None:
+def run_from_mcap(options: McapImportOptions) -> None:
     """Import every file; the dataset appears when it is complete."""
     paths = list_files(options.source)
     with progress(len(paths), "import") as bar:

@@ -7,9 +7,9 @@ from manip_il.cli.imitation import RecordOptions
 from manip_il.cli.outputs import locked
 from manip_il.cli.progress import Stages, say, say_next
 from manip_il.collect.inputs import env_config
-from manip_il.collect.record import journals_of, record
+from manip_il.collect.record import record
 from manip_il.data.atomic import DATASET, EPISODES
-from manip_il.data.journal import list_seeds
+from manip_il.data.journal import journals_of, list_seeds
 from manip_il.data.video_config import VideoConfig
 from manip_il.evaluation.suites import varied
 

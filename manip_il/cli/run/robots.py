@@ -1,35 +1,36 @@
 """Run `manip-il robot new`, `check`, `certify`."""
 
 import os
-from dataclasses import replace
 
 from manip_il import checks
-from manip_il.cli.outputs import OutputFile, about, publish
+from manip_il.cli.outputs import OutputFile, publish
 from manip_il.cli.progress import progress, say
 from manip_il.cli.robots import (
     CertifyOptions,
-    EnvCheckOptions,
     RobotCheckOptions,
     RobotNewOptions,
 )
 from manip_il.collect.inputs import env_config
 from manip_il.collect.workers import Engine
-from manip_il.data.atomic import write_file, write_json
+from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError
-from manip_il.evaluation import robot_check
 from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
-from manip_il.evaluation.robot_check import advice, check_robot, verdict
-from manip_il.evaluation.world_check import check_world
+from manip_il.evaluation.robot_check import FILE_NAME as CHECK_FILE
+from manip_il.evaluation.robot_check import (
+    advice,
+    check_report,
+    check_robot,
+    verdict,
+)
+from manip_il.progress import Progress
+from manip_il.robots.found import suggest, yaml_of
 from manip_il.robots.gripper import sweep
-from manip_il.robots.suggest import suggest, yaml_of
 from manip_il.robots.table import get_robot
 from manip_il.tasks import NAMES
 from manip_il.tasks.table import get_task
 
-PAGE = "check.html"
 
-
-def run_robot_new(options: RobotNewOptions) -> None:
+def run_new(options: RobotNewOptions) -> None:
     """Write the YAML file, check the robot, print what is left to do.
 
     Raises `ManipError` if it can do no task.
@@ -45,13 +46,13 @@ def run_robot_new(options: RobotNewOptions) -> None:
     write_file(target, yaml_of(found, *paths).encode())
     say(f"robot: {target}")
     with Engine(None) as engine:
-        checked = check_robot(target, list(NAMES), 0, engine, lambda _: None)
+        checked = check_robot(target, list(NAMES), 0, engine, Progress())
     say(verdict(checked), *(f"change: {line}" for line in advice(checked)))
     if len(checked.failed) == len(NAMES):
         raise ManipError(f"{target} cannot do any task yet; see above")
 
 
-def run_robot_check(options: RobotCheckOptions) -> None:
+def run_check(options: RobotCheckOptions) -> None:
     """Measure, print the tables, write the report. Raises `ManipError` if a task cannot be done."""
     # raises, before anything is written, if the robot cannot be used
     sweep(get_robot(options.robot))
@@ -63,14 +64,17 @@ def run_robot_check(options: RobotCheckOptions) -> None:
             progress(2 * options.episodes * len(tasks), f"check {options.robot}") as bar,
             Engine(None) as engine,
         ):
-            found = robot_check.check_robot(
-                options.robot, tasks, options.episodes, engine, lambda _: bar.step()
-            )
-        write_json(folder / robot_check.FILE_NAME, found.to_json())
-        replace(robot_check.check_report(found), **about(options)).write(folder / PAGE)
-    robot_check.task_table(found).print()
-    say(robot_check.verdict(found), *(f"change: {line}" for line in robot_check.advice(found)))
-    say(f"page: {folder / PAGE}")
+            found = check_robot(options.robot, tasks, options.episodes, engine, bar)
+        page = check_report(found)
+        publish(
+            folder / CHECK_FILE,
+            found.to_json(),
+            page.sections[0].tables,
+            page.verdict,
+            *(f"change: {line}" for line in page.facts),
+            page=page,
+            options=options,
+        )
     if found.failed:
         names = ", ".join(task.name for task in found.failed)
         raise ManipError(
@@ -92,15 +96,3 @@ def run_certify(options: CertifyOptions) -> None:
         mu = certificate.mu
         lines = () if mu is None else (f"u of Ross et al. (2011) is at least {mu} steps",)
         publish(folder / FILE_NAME, certificate.to_json(), [certificate.table()], *lines)
-
-
-def run_env_check(options: EnvCheckOptions) -> None:
-    """Print the checks. Raises `ManipError` if a part of the contract is not kept."""
-    config = env_config({"robot": options.world, "task": options.task})
-    failed = list[str]()
-    with progress(options.episodes, f"check {options.world}") as bar:
-        for check in check_world(config, options.episodes, bar.step):
-            say(str(check))
-            failed += [check.what] if check.advice else []
-    if failed:
-        raise ManipError(f"{options.world} does not keep the contract: {', '.join(failed)}")

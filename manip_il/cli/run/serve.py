@@ -13,7 +13,7 @@ from manip_il.evaluation.suites import varied
 from manip_il.learn.checkpoint import find_policy
 from manip_il.serve.config import LEADERS, SessionConfig
 from manip_il.serve.session import serve
-from manip_il.sim.window import has_display
+from manip_il.sim.view import has_display
 
 SERVO = "servo"  # a value of --vary
 

@@ -17,7 +17,7 @@ from manip_il.evaluation.suites import suite_conditions
 from manip_il.evaluation.watch import RerunLog, WindowScreen, outcome
 from manip_il.seeding import BLOCK, stream_seeds
 from manip_il.sim.config import FILM, LONGEST_EPISODE, CameraConfig, Look
-from manip_il.sim.window import has_display
+from manip_il.sim.view import has_display
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import env_spec, make_env
 

@@ -54,13 +54,8 @@ class PathProblem:
     @cached_property
     def numbers(self) -> Any:
         """Edge numbers, counted from 1, as a sparse matrix (from, to), (S, S)."""
-        return csr_array(
-            (np.arange(1, len(self.edges) + 1), self.edges.T), shape=(self.nodes, self.nodes)
-        )
-
-    def costs(self, weights: F64) -> F64:
-        """Return the cost of every edge, (E,), for non-negative weights (K,)."""
-        return self.features @ weights
+        numbers = np.arange(1, len(self.edges) + 1)
+        return csr_array((numbers, self.edges.T), shape=(self.nodes, self.nodes))
 
     def matrix(self, values: F64) -> Any:
         """Return the edges' values (E,) as a sparse matrix (from, to), (S, S).
@@ -89,52 +84,47 @@ class Plan:
     """The cheapest path to the goal from every node.
 
     Attributes:
+        problem: The graph and its features.
         costs: The cost of each node's path, (S,), infinite if no path leads to the goal.
         following: The next node on each node's path, (S,), negative at the goal and if there is no
             path.
     """
 
+    problem: PathProblem
     costs: F64
     following: I64
 
+    def path(self, start: int) -> tuple[I64, F64]:
+        """Return the path from a node to the goal.
 
-def plan(problem: PathProblem, weights: F64) -> Plan:
-    """Return the cheapest path from every node for weights (K,)."""
-    return plan_edges(problem, problem.costs(weights))
+        Args:
+            start: The number of the node where the path begins.
+
+        Returns:
+            The path's nodes (n,), of which the last is the goal, and its feature sums (K,).
+
+        Raises:
+            ManipError: If no path leads from `start` to the goal.
+        """
+        if not np.isfinite(self.costs[start]):
+            raise ManipError(f"no path leads from node {start} to the goal")
+        path = [start]
+        while path[-1] != self.problem.goal:
+            path.append(int(self.following[path[-1]]))
+        nodes = np.array(path, np.int64)
+        return nodes, self.problem.sums(nodes)
 
 
-def plan_edges(problem: PathProblem, costs: F64) -> Plan:
-    """Return the cheapest path from every node for edge costs (E,), 0 or more.
-
-    Dijkstra's algorithm runs backwards from the goal.
-    """
-    found, following = dijkstra(
-        problem.matrix(costs).T.tocsr(), indices=problem.goal, return_predecessors=True
-    )
-    return Plan(found, following)
-
-
-def cheapest_path(problem: PathProblem, planned: Plan, start: int) -> tuple[I64, F64]:
-    """Return a plan's path from a node to the goal.
+def plan(problem: PathProblem, weights: F64, margins: F64 | float = 0.0) -> Plan:
+    """Return the cheapest path from every node, by Dijkstra's algorithm backwards from the goal.
 
     Args:
         problem: The graph and its features.
-        planned: The plan for this problem.
-        start: The number of the node where the path begins.
-
-    Returns:
-        The path's nodes (n,), of which the last is the goal, and its feature sums (K,).
-
-    Raises:
-        ManipError: If no path leads from `start` to the goal.
+        weights: The cost of each feature, (K,), 0 or more.
+        margins: What is subtracted from the edges' costs, (E,); none may become negative.
     """
-    if not np.isfinite(planned.costs[start]):
-        raise ManipError(f"no path leads from node {start} to the goal")
-    path = [start]
-    while path[-1] != problem.goal:
-        path.append(int(planned.following[path[-1]]))
-    nodes = np.array(path, np.int64)
-    return nodes, problem.sums(nodes)
+    costs = problem.matrix(problem.features @ weights - margins)
+    return Plan(problem, *dijkstra(costs.T.tocsr(), indices=problem.goal, return_predecessors=True))
 
 
 @dataclass(frozen=True)
@@ -164,35 +154,27 @@ def stages(demonstrations: Sequence[Demonstration]) -> list[Sequence[Demonstrati
     return [few, demonstrations] if len(few) >= _FEW else [demonstrations]
 
 
-def rivals(demonstrations: Sequence[Demonstration], tastes: F64) -> list[F64]:
-    """Return the feature sums (m, K) of each demonstration's alternatives.
-
-    Alternatives are the distinct paths that are cheapest for one of the weight vectors `tastes` (n,
-    K). The demonstration's own sums come first, so m is at most n + 1.
-    """
-    return add_rivals(demonstrations, [one.sums[None] for one in demonstrations], tastes)
-
-
-def add_rivals(
-    demonstrations: Sequence[Demonstration], sums: Sequence[F64], tastes: F64
+def rivals(
+    demonstrations: Sequence[Demonstration], tastes: F64, known: Sequence[F64] = ()
 ) -> list[F64]:
-    """Add the alternatives for further weight vectors to the result of `rivals`.
+    """Return the feature sums of each demonstration and of its alternatives.
+
+    Alternatives are the paths that are cheapest for one of the weight vectors.
 
     Args:
         demonstrations: The demonstrated paths.
-        sums: The feature sums known so far, (m, K) for each demonstration.
-        tastes: The further weight vectors, (n, K).
+        tastes: The weight vectors, (n, K).
+        known: The result for other weight vectors, to which the alternatives are added.
 
     Returns:
-        The distinct feature sums for each demonstration, at most (m + n, K), in which the known
-        ones come first.
+        The distinct feature sums for each demonstration, (m, K); its own come first.
     """
     found = []
-    for one, known in zip(demonstrations, sums, strict=True):
-        more = [
-            cheapest_path(one.problem, plan(one.problem, taste), one.start)[1] for taste in tastes
-        ]
-        every = np.concatenate([known, more])
+    for one, before in zip(
+        demonstrations, known or [d.sums[None] for d in demonstrations], strict=True
+    ):
+        more = [plan(one.problem, taste).path(one.start)[1] for taste in tastes]
+        every = np.concatenate([before, more])
         _, first = np.unique(every.round(_DIGITS), axis=0, return_index=True)
         found.append(every[np.sort(first)])
     return found
@@ -241,15 +223,14 @@ class _Links(NamedTuple):
 @lru_cache(4)
 def _links(shape: tuple[int, ...]) -> _Links:
     steps = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)]) - 1
-    places = _indices(shape)[:, None]
-    to = places + steps
+    places = _indices(shape)
+    to = places[:, None] + steps
     inside = ((to >= 0) & (to < shape)).all(axis=2)
-    start, end = np.broadcast_to(places, to.shape)[inside], to[inside]
-    nodes = [_numbers(index, shape) for index in (start, end)]
-    doubled = [_numbers(index, _finer(shape)) for index in (2 * start, start + end, 2 * end)]
-    return _Links(
-        np.stack(nodes, axis=1), np.stack(doubled, axis=1), np.linalg.norm(end - start, axis=1)
-    )
+    start, way = np.nonzero(inside)
+    edges = np.stack([start, _numbers(to[inside], shape)], axis=1)
+    ends = _numbers(2 * places, _finer(shape))[edges]
+    fine = np.insert(ends, 1, ends.sum(axis=1) // 2, axis=1)
+    return _Links(edges, fine, np.linalg.norm(steps, axis=1)[way])
 
 
 def _finer(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -324,12 +305,11 @@ class Grid:
         return _Links(every.edges[kept], every.fine[kept], self.cell * every.cells[kept])
 
     def _integrals(self, densities: F64) -> F64:
-        """Integrals (E, ...) along the edges of densities (F, ...) at nodes and middles, by
+        """Integrals (E, K) along the edges of densities (F, K) at nodes and middles, by
         Simpson's rule.
         """
         start, middle, end = (densities[places] for places in self._links.fine.T)
-        lengths = self._links.cells.reshape(-1, *[1] * (densities.ndim - 1))
-        return lengths * (start + 4 * middle + end) / 6
+        return self._links.cells[:, None] * (start + 4 * middle + end) / 6
 
     @cached_property
     def problem(self) -> PathProblem:
@@ -337,8 +317,7 @@ class Grid:
 
         Features are integrated along each edge.
         """
-        features = self._integrals(self.layout.densities(self._fine))
-        return PathProblem(self._links.edges, features, len(self.points), self.goal)
+        return self._problem(self._integrals(self.layout.densities(self._fine)), self.goal)
 
     def costs_to_go(self, weights: F64) -> F64:
         """Return the cost of the cheapest path from each node to the goal, (S,).
@@ -346,13 +325,15 @@ class Grid:
         Args:
             weights: The cost per metre of each feature, (K,).
         """
-        costs = self._integrals(self.layout.densities(self._fine) @ weights)
-        return self._plan(costs, self.goal)[1].costs
+        prices = self.layout.densities(self._fine) @ weights
+        return self._shortest(self._integrals(prices[:, None]), self.goal).costs
 
-    def _plan(self, costs: F64, goal: int) -> tuple[PathProblem, Plan]:
-        """The cheapest paths to a node for costs (E,) of the edges."""
-        problem = PathProblem(self._links.edges, costs[:, None], len(self.points), goal)
-        return problem, plan(problem, np.ones(1))
+    def _problem(self, features: F64, goal: int) -> PathProblem:
+        return PathProblem(self._links.edges, features, len(self.points), goal)
+
+    def _shortest(self, costs: F64, goal: int) -> Plan:
+        """The cheapest paths to a node for costs (E, 1) of the edges."""
+        return plan(self._problem(costs, goal), np.ones(1))
 
     def near(self, position: F64) -> I64:
         """Return the free nodes within `AHEAD` cells of a position (3,) [m], (n,)."""
@@ -384,18 +365,15 @@ class Grid:
             # skips detours that return to this node
             begin = len(nodes) - 1 - nodes[::-1].index(path[-1])
             nodes = nodes[begin:]
-            ahead = [
-                place
-                for place, node in enumerate(nodes[1:_LOOK], 1)
-                if self.problem.numbers[path[-1], node]
-            ]
-            last = ahead[-1] if ahead else 1
-            path += [nodes[last]] if ahead else self._between(path[-1], nodes[last])
-            nodes = nodes[last:]
+            joined = self.problem.numbers[path[-1], nodes[:_LOOK]].nonzero()[-1]
+            last = int(joined.max(initial=0))
+            path += [nodes[last]] if last else self._between(path[-1], nodes[1])
+            nodes = nodes[last or 1 :]
         return np.array(path, np.int64)
 
     def _between(self, start: int, end: int) -> list[int]:
-        return cheapest_path(*self._plan(self._links.cells, end), start)[0][1:].tolist()
+        nodes, _ = self._shortest(self._links.cells[:, None], end).path(start)
+        return nodes[1:].tolist()
 
 
 _AROUND = np.array([step for step in np.ndindex(*[2 * AHEAD + 1] * 3)]) - AHEAD

@@ -10,10 +10,8 @@ reward has a weight for each feature.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -122,14 +120,6 @@ class Layout:
             for name, place in self.places
         )
 
-    @cached_property
-    def meeting(self) -> bool:
-        """Whether two obstacles overlap."""
-        return any(
-            bool((np.abs(middle - other) < half + its).all())
-            for (_, middle, half, _), (_, other, its, _) in combinations(self.boxes, 2)
-        )
-
     def densities(self, points: F64) -> F64:
         """Return the features per metre of path at points (N, 3) [m], (N, K)."""
         found = np.zeros((len(points), len(FEATURES)))
@@ -201,29 +191,15 @@ class Reward:
 
     def __post_init__(self) -> None:
         for name, weight in zip(FEATURES, self.weights, strict=True):
-            if not 0 <= weight <= MOST:
-                raise UsageError(f"weight of {name} is {weight:g}; expected 0 to {MOST:g}")
-        if not self.weights[0]:
-            raise UsageError(
-                "weight of length is 0; expected more than 0, as paths could otherwise have any"
-                " length"
-            )
-
-    @classmethod
-    def of(cls, weights: Mapping[str, float]) -> Reward:
-        """Return a reward from weights by feature, 0 by default.
-
-        Raises:
-            UnknownName: If a feature is unknown.
-            UsageError: If a weight is invalid, see `Reward`.
-        """
-        if unknown := [name for name in weights if name not in FEATURES]:
-            raise UnknownName("feature", unknown[0], FEATURES)
-        return cls(tuple(weights.get(name, 0.0) for name in FEATURES))
+            if not 0 <= weight <= MOST or (name == "length" and not weight):
+                raise UsageError(
+                    f"weight of {name} is {weight:g}; expected 0 to {MOST:g}, and more than 0 for"
+                    " length, as paths could otherwise have any length"
+                )
 
     @classmethod
     def parse(cls, text: NameOrPath) -> Reward:
-        """Return the reward that a text or a file describes.
+        """Return the reward that a text or a file describes; weights are 0 by default.
 
         Args:
             text: The name of a shipped reward, or `NAME=NUMBER,...`; or the `Path` of a
@@ -249,7 +225,9 @@ class Reward:
             raise UsageError(
                 f"reward is {shorten(str(text))}: {checks.one_line(error)}; expected {expected}"
             ) from None
-        return cls.of(weights)
+        if unknown := [name for name in weights if name not in FEATURES]:
+            raise UnknownName("feature", unknown[0], FEATURES)
+        return cls(tuple(weights.get(name, 0.0) for name in FEATURES))
 
     @property
     def numbers(self) -> str:

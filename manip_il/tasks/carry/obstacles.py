@@ -12,7 +12,8 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.geometry import outline
-from manip_il.sim.world import SCENES_KEPT, Scene, World
+from manip_il.sim.scene import SCENES_KEPT
+from manip_il.sim.world import Scene, World
 from manip_il.tasks.carry.layout import (
     DEFAULT,
     FEATURES,
@@ -26,6 +27,7 @@ from manip_il.tasks.carry.layout import (
 )
 from manip_il.tasks.grasp import once_per_state
 from manip_il.tasks.objects import add_furniture, add_part
+from manip_il.tasks.pick_place import OBJECT
 
 EDGE = "edge"  # the mocap body of the table's edge; its x points away from the table
 # mocap bodies that hold the weights
@@ -114,12 +116,12 @@ def is_there(world: World, name: str) -> bool:
 
 
 @once_per_state
-def layout_of(world: World, name: str) -> Layout:
-    """Return the layout of an episode in which an object is carried to the goal."""
+def layout_of(world: World) -> Layout:
+    """Return the layout of an episode."""
     places = {obstacle: world.at(obstacle) for obstacle in OBSTACLES if is_there(world, obstacle)}
     edge, turn = world.pose(EDGE)
     seen = (edge, turn[:, 0]) if is_there(world, EDGE) else None
-    return make_layout(world.scene, world.extents(name), world.goal, places, seen)
+    return make_layout(world.scene, world.extents(OBJECT), world.goal, places, seen)
 
 
 def make_layout(
@@ -153,20 +155,14 @@ def make_layout(
     )
 
 
-def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layout:
-    """Return the layout that an observation describes.
-
-    Args:
-        scene: The scene that was observed.
-        name: The name of the object that is carried.
-        seen: The numbers of `environment_state`, by name.
-    """
+def observed_layout(scene: Scene, seen: Mapping[str, float]) -> Layout:
+    """Return the layout that the numbers of `environment_state`, by name, describe."""
 
     def vector(of: str) -> F64:
         return np.array([seen[f"{of}.{axis}"] for axis in "xyz"], dtype=np.float64)
 
-    width = seen[f"{name}.width"]
-    lengths = [width, seen.get(f"{name}.length", width), seen.get(f"{name}.height", width)]
+    width = seen[f"{OBJECT}.width"]
+    lengths = [seen.get(f"{OBJECT}.{which}", width) for which in ("width", "length", "height")]
     places = {one: vector(one) for one in OBSTACLES if seen[f"{one}.here"] > 0.5}
     edge = (vector(EDGE), vector(f"{EDGE}.outwards")) if seen[f"{EDGE}.here"] > 0.5 else None
     return make_layout(scene, lengths, vector("goal"), places, edge)
@@ -218,7 +214,13 @@ def hand_of(scene: Scene) -> HandShape:
     data.qpos[scene.arm_q] = scene.robot.home
     scene.gripper.put(data, scene.gripper.most)
     mujoco.mj_kinematics(model, data)
-    ee, moved = data.site_xpos[scene.ee_site], _last_bodies(scene)
+    # what the arm's last two joints move
+    [first] = model.jnt_bodyid[model.jnt_qposadr == scene.arm_q[-2]].tolist()
+    moved = {first}
+    for body in range(first + 1, model.nbody):
+        if int(model.body_parentid[body]) in moved:
+            moved.add(body)
+    ee = data.site_xpos[scene.ee_site]
     axes = data.site_xmat[scene.ee_site].reshape(3, 3)[:, :2]
     outlines = [
         outline(model, data, geom) - ee
@@ -271,14 +273,3 @@ def fits(hand: HandShape, at: Sequence[float], yaw: float, layout: Layout) -> bo
             if max(apart.max(), across.max()) < _BARELY:
                 return False
     return True
-
-
-def _last_bodies(scene: Scene) -> set[int]:
-    """Bodies that the arm's last two joints move."""
-    model = scene.model
-    first = int(model.jnt_bodyid[np.flatnonzero(model.jnt_qposadr == scene.arm_q[-2])[0]])
-    found = {first}
-    for body in range(first + 1, model.nbody):
-        if int(model.body_parentid[body]) in found:
-            found.add(body)
-    return found

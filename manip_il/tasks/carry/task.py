@@ -82,7 +82,7 @@ _SIDES = ((1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 def descent_of(world: World) -> Descent:
     """Return the costs-to-go of a world's episode, as a `Descent` to the goal."""
-    return descent(layout_of(world, OBJECT), reward_in(world), world.robot)
+    return descent(layout_of(world), reward_in(world), world.robot)
 
 
 @once_per_state
@@ -101,7 +101,7 @@ def _to_goal(world: World) -> Target:
     at, ee = world.at(OBJECT), world.ee.position
     position = ee + (0.0 if heading is None else heading - at)
     position[2] = max(position[2], world.robot.ee.lowest)
-    beside = layout_of(world, OBJECT).room(at[None])[0] < 0  # a turning hand would hit an obstacle
+    beside = layout_of(world).room(at[None])[0] < 0  # a turning hand would hit an obstacle
     yaw = world.hand_yaw if beside else world.ahead(position)
     return Target(position, hand_down(yaw), CLOSED, max_step=STEP)
 
@@ -111,18 +111,13 @@ def _rise(world: World) -> float:
 
     It grows with misalignment until the hand clears every obstacle.
     """
-    layout, g = layout_of(world, OBJECT), grasp_of(world, OBJECT)
+    layout, g = layout_of(world), grasp_of(world, OBJECT)
     if not layout.boxes:
         return 0.0
     tallest = max(height for _, _, _, height in layout.boxes)
     # height at which an open hand clears all
     safe = tallest + ABOVE - min(part.bottom for part in layout.parts[1:])
     return min(STEEP * max(0.0, g.off - OVER), max(0.0, safe - g.at[2]))
-
-
-def _approach(world: World, name: str, hover: float) -> Target:
-    """Approach as for any object, but above all obstacles until the hand is over the object."""
-    return approach(world, name, hover, _rise(world))
 
 
 @dataclass(frozen=True)
@@ -142,7 +137,10 @@ class Carry(PickPlace):
     rungs = (
         Rung("at_goal", lambda w: is_held(w, OBJECT) and _at_goal(w), _to_goal),
         Rung("carry", lambda w: is_held(w, OBJECT), _to_goal),
-        *grasp_rungs(lambda w: OBJECT, approach=_approach),
+        # above all obstacles until the hand is over the object
+        *grasp_rungs(
+            lambda w: OBJECT, approach=lambda w, name, hover: approach(w, name, hover, _rise(w))
+        ),
     )
     scale: float = 1.0
     reward: Reward = TASTES[DEFAULT]
@@ -204,11 +202,9 @@ class Carry(PickPlace):
     def unsound(self, world: World) -> str:
         """Return why there is no sound label, or "" if there is one.
 
-        There is none if obstacles overlap, the hand has no room, or no path leads to the goal.
+        There is none if the hand has no room, or no path leads to the goal.
         """
-        layout, at = layout_of(world, OBJECT), world.at(OBJECT)
-        if layout.meeting:
-            return "two obstacles overlap"
+        layout, at = layout_of(world), world.at(OBJECT)
         if is_held(world, OBJECT):
             leads = _at_goal(world) or _look(world)[1] is not None
         else:

@@ -166,8 +166,7 @@ class GymEnv(Environment):
         return {name: np.asarray(at) for name, at in self.world.positions(self.env).items()}
 
     def _count(self, step: int, streak: int, ever: bool) -> None:
-        self._step = step
-        self._streak = streak
+        self._step, self._streak = step, streak
         self._ever = ever
 
     def _numbers_seen(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -21,16 +21,15 @@ from manip_il.checks import check_unchanged
 from manip_il.mdp import F64, STATE_EXTRAS, State
 from manip_il.option import NameOrPath
 from manip_il.robots import ROBOTS
-from manip_il.robots.files import ModelFiles
-from manip_il.robots.robot import Robot
+from manip_il.robots.robot import ModelFiles, Robot
 from manip_il.robots.spec import model_bytes
 from manip_il.robots.table import get_robot, is_robot
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv, environment_state_names
 from manip_il.sim.mesh import mesh_path
-from manip_il.sim.points import point_names
-from manip_il.sim.props import VERSION as DRAWN
+from manip_il.sim.render import LOOK_VERSION as DRAWN
+from manip_il.sim.render import point_names
 from manip_il.sim.scene import Scene, build_scene
 from manip_il.sim.shape import MESH, ObjectShape, stored
 from manip_il.sim.task import Task, phases

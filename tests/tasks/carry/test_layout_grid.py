@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from manip_il.robots.reach import reach_of
 from manip_il.robots.table import get_robot
-from manip_il.tasks.carry.grid import Grid, cheapest_path, descent, plan
-from manip_il.tasks.carry.layout import FEATURES, TASTES, Edge, Layout, Part, Reward
+from manip_il.tasks.carry.grid import Grid, descent, plan
+from manip_il.tasks.carry.layout import FEATURES, TASTES, Edge, Layout, Part
 
 from ...tables import every_robot
 from .features import path_features
@@ -43,13 +43,7 @@ def node_near(position: np.ndarray) -> int:
 
 
 def weights_with(**weights: float) -> np.ndarray:
-    return np.array(Reward.of({"length": 1.0, **weights}).weights)
-
-
-def test_a_layouts_grid_has_ten_thousand_nodes_and_the_goal_is_one_of_them():
-    assert len(grid().points) >= 10_000
-    np.testing.assert_allclose(grid().points[grid().goal], LAYOUT.goal, atol=1e-12)
-    assert grid().free[grid().goal]
+    return np.array([{"length": 1.0, **weights}.get(name, 0.0) for name in FEATURES])
 
 
 @pytest.mark.parametrize("taste", TASTES)
@@ -58,15 +52,13 @@ def test_costs_to_go_are_the_cheapest_paths_features_times_the_weights(taste: st
     costs, planned = grid().costs_to_go(weights), plan(problem, weights)
     np.testing.assert_allclose(costs, planned.costs, rtol=1e-9)
     for start in STARTS:
-        path, features = cheapest_path(problem, planned, node_near(start))
+        path, features = planned.path(node_near(start))
         assert features @ weights == pytest.approx(costs[path[0]], rel=1e-9)
 
 
 def test_an_edges_features_are_the_line_integrals_of_any_path():
     for start in STARTS:
-        path, features = cheapest_path(
-            grid().problem, plan(grid().problem, np.array(CAREFUL.weights)), node_near(start)
-        )
+        path, features = plan(grid().problem, np.array(CAREFUL.weights)).path(node_near(start))
         along = path_features(LAYOUT, grid().points[path])
         np.testing.assert_allclose(features, along, rtol=0.01, atol=5e-4)
         assert features[0] == pytest.approx(along[0], rel=1e-12)
@@ -79,9 +71,7 @@ def test_a_heavier_weight_keeps_planned_paths_no_nearer(name: str):
     at, found = FEATURES.index(name), []
     for weight in (0.0, 0.5, 2.0, 8.0, 30.0):
         planned = plan(grid().problem, weights_with(**{name: weight}))
-        found.append(
-            [cheapest_path(grid().problem, planned, node_near(start))[1][at] for start in STARTS]
-        )
+        found.append([planned.path(node_near(start))[1][at] for start in STARTS])
     assert (np.diff(found, axis=0) <= 1e-9).all()
     assert (np.array(found[-1]) < found[0]).any()
 
@@ -103,16 +93,6 @@ def test_the_descent_leads_to_the_goal_past_all_obstacles(seed: int):
     assert math.dist(position, LAYOUT.goal) < 0.005
     assert np.diff(costs).max(initial=0.0) < 0.02 * costs[0] + 0.01
     assert costs[-1] < 0.05
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_the_descent_leads_on_from_beside_any_node(seed: int):
-    down, rng = descent(LAYOUT, CAREFUL, ROBOT), np.random.default_rng(seed)
-    node = rng.choice(np.flatnonzero(np.isfinite(down.costs)))
-    position = grid().points[node] + rng.uniform(-1e-3, 1e-3, 3)
-    heading = down.look(position)[1]
-    assert heading is not None
-    assert node == grid().goal or np.linalg.norm(heading - position) > 0.005
 
 
 @every_robot

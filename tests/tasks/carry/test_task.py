@@ -2,6 +2,8 @@
 not observed.
 """
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 
@@ -63,7 +65,7 @@ def test_a_tastes_own_way_costs_it_less_than_anothers():
     for seed in range(SEED, SEED + 6):
         for taste in TASTES:
             env = started("panda", f"carry:{taste}", seed)
-            features = path_features(layout_of(env.world, OBJECT), carried(env))
+            features = path_features(layout_of(env.world), carried(env))
             for other in TASTES:
                 costs[taste][other] += features @ np.array(TASTES[other].weights)
     for taste in TASTES:
@@ -109,8 +111,9 @@ def test_one_to_four_obstacles_stand_where_they_leave_room(robot: str):
         env.start(seed)
         there = [name for name in (*OBSTACLES, EDGE) if is_there(env.world, name)]
         counts.append(len(there))
-        layout = layout_of(env.world, OBJECT)
-        assert not layout.meeting
+        layout = layout_of(env.world)
+        for (_, at, half, _), (_, other, its, _) in combinations(layout.boxes, 2):
+            assert (np.abs(at - other) > half + its).any()
         ends = np.array([env.world.pose(OBJECT).position, env.world.goal])
         assert layout.room(ends).min() >= 0
         if layout.edge is not None:
@@ -125,7 +128,7 @@ def test_what_is_observed_is_the_layout():
     for seed in STARTS:
         world = started("panda", "carry", seed).world
         seen = dict(zip(names, environment_state(world).tolist(), strict=True))
-        layout, observed = layout_of(world, OBJECT), observed_layout(world.scene, OBJECT, seen)
+        layout, observed = layout_of(world), observed_layout(world.scene, seen)
         assert [name for name, _ in observed.places] == [name for name, _ in layout.places]
         points = np.array([*world.scene.robot.workspace.centre, 0.1]) + np.random.default_rng(
             0
@@ -147,17 +150,12 @@ def test_without_a_free_path_or_room_a_label_is_none_and_says_why():
     place(env.world, GOAL, env.world.goal)
     place(env.world, "vase", env.world.goal)
     label = expert.label(env.get_state())
-    assert (label.valid, label.reason) in {
-        (False, "no free path to the goal"),
-        (False, "two obstacles overlap"),
-    }
+    assert (label.valid, label.reason) == (False, "no free path to the goal")
     env.set_state(state)
     for name in OBSTACLES:
         env.world.place(name, np.array([0.45, 0.0, -0.25]), UPRIGHT)
     place(env.world, "vase", env.world.pose(OBJECT).position + [0.06, 0.06, 0.0])
     assert expert.label(env.get_state()).reason == "no room for the hand beside an obstacle"
-    place(env.world, "candle", env.world.pose("vase").position)
-    assert expert.label(env.get_state()).reason == "two obstacles overlap"
 
 
 def test_an_object_beside_a_low_obstacle_is_grasped_where_the_hand_fits():
@@ -167,5 +165,5 @@ def test_an_object_beside_a_low_obstacle_is_grasped_where_the_hand_fits():
     env.world.place(GOAL, np.array([0.45, 0.1, 0.15]), UPRIGHT)
     env.world.place(OBJECT, np.array([0.45, -0.1, 0.025]), UPRIGHT)
     place(env.world, "laptop", np.array([0.545, -0.1, 0.0]))
-    assert layout_of(env.world, OBJECT).room(env.world.pose(OBJECT).position[None])[0] < -0.012
+    assert layout_of(env.world).room(env.world.pose(OBJECT).position[None])[0] < -0.012
     carried(env)
