@@ -67,6 +67,9 @@ class Workplace:
         self.ours.run(small, self.folder, str(line))
 
     def _python_block(self, block: Block) -> None:
+        """`# NAME.py` in its first line names a file of the user's own for the lines that follow."""
+        if named := re.fullmatch(r"# (\w+\.py)", block.text.splitlines()[0]):
+            (self.folder / named[1]).write_text(block.text, encoding="utf-8")
         words = ("python", *(name for name in RECIPES if f'"{name}"' in block.text))
         self.stock.bring(words, self.folder, self.ours)
         self.ours.execute(block.text, self.folder, block.where)
