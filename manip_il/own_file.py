@@ -4,6 +4,7 @@ import hashlib
 import importlib.util
 import inspect
 import sys
+import traceback
 from functools import cache
 from pathlib import Path
 
@@ -36,13 +37,19 @@ def own_class[T](path: Path, base: type[T], wanted: str) -> type[T]:
     except Exception as error:
         del sys.modules[name]
         raise UsageError(
-            f"{path} cannot be run: {type(error).__name__}: {checks.one_line(error)}"
+            f"{_line(path, error)} cannot be run: {type(error).__name__}: {checks.one_line(error)}"
         ) from error
     own = [one for one in vars(module).values() if inspect.isclass(one) and one.__module__ == name]
     found = [cls for cls in own if issubclass(cls, base) and not cls.__name__.startswith("_")]
     if len(found) != 1:
         names = ", ".join(cls.__name__ for cls in found) or "none"
-        raise UsageError(
-            f"{base.__name__}s in {path}: {names}; expected one subclass of {wanted}"
-        )
+        raise UsageError(f"{base.__name__}s in {path}: {names}; expected one subclass of {wanted}")
     return found[0]
+
+
+def _line(path: Path, error: BaseException) -> str:
+    """Return a file's path, with the last line that ran before an error."""
+    lines = [
+        one.lineno for one in traceback.extract_tb(error.__traceback__) if one.filename == str(path)
+    ]
+    return f"{path}, line {lines[-1]}" if lines else str(path)

@@ -487,7 +487,7 @@ def _unknown_option(kind: str, name: str, known: Known, dashes: str, command: st
     `num_episodes` finds `dataset.num_episodes`. kind: `option`, or `key in FILE:`. dashes: prefix
     of the names.
     """
-    named = [one.label.replace("--", dashes) for one in known.values() if not one.positional]
+    named = [dashes + key for key, one in known.items() if not one.positional]
     near = nearest(dashes + name, named, _MOST_OFFERED)
     return UsageError(
         f"unknown {kind} {shorten(dashes + name)}{near}; manip-il {command} --help=all lists all"
