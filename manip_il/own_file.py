@@ -3,6 +3,7 @@
 import hashlib
 import inspect
 import sys
+import traceback
 from functools import cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
@@ -34,7 +35,7 @@ def own_class[T](path: Path, base: type[T], wanted: str) -> type[T]:
     except Exception as error:
         del sys.modules[name]
         raise UsageError(
-            f"{path} cannot be run: {type(error).__name__}: {checks.one_line(error)}"
+            f"{_line(path, error)} cannot be run: {type(error).__name__}: {checks.one_line(error)}"
         ) from error
     found = [
         value
@@ -46,3 +47,11 @@ def own_class[T](path: Path, base: type[T], wanted: str) -> type[T]:
         names = ", ".join(cls.__name__ for cls in found) or "none"
         raise UsageError(f"{base.__name__}s in {path}: {names}; expected one subclass of {wanted}")
     return found[0]
+
+
+def _line(path: Path, error: BaseException) -> str:
+    """Return a file's path, with the last line that ran before an error."""
+    lines = [
+        one.lineno for one in traceback.extract_tb(error.__traceback__) if one.filename == str(path)
+    ]
+    return f"{path}, line {lines[-1]}" if lines else str(path)

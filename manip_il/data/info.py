@@ -147,9 +147,7 @@ def read_info(root: Path) -> Info:
             " first: manip-il pull hf://datasets/USER/NAME FOLDER"
         )
     if not path.exists():
-        raise ManipError(
-            f"{root} is not a LeRobot dataset: {layout.INFO} is missing"
-        )
+        raise ManipError(f"{root} is not a LeRobot dataset: {layout.INFO} is missing")
     raw = checks.read_json(path, "a dataset's description")
     version = raw.get("codebase_version")
     if version != layout.VERSION:

@@ -7,7 +7,7 @@ from manip_il import checks
 from manip_il.errors import UnknownName, UsageError
 from manip_il.sim.conditions import Condition, merged
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.table import world_of
+from manip_il.worlds.table import env_spec, world_of
 
 SUITES = {
     "nominal": ("nominal",),
@@ -60,7 +60,7 @@ def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Conditi
 
     Raises:
         UnknownName: for an unknown name.
-        UsageError: if a file is invalid, or if nothing has an effect.
+        UsageError: if a file is invalid, if nothing has an effect, or the environment cannot vary.
     """
     if not names:
         return ()
@@ -71,6 +71,7 @@ def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Conditi
     asked = merged([read_condition(name) for name in names])
     kept = world_of(env.robot).affecting(env, asked, sees=sees)
     if kept is None:
+        env_spec(env).require("varied", "leave out --vary")
         raise UsageError(
             f"--vary={','.join(names)} changes nothing for"
             f" {env.task}{'' if sees else ' without cameras'}"

@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -168,6 +169,12 @@ def test_pictures_are_of_the_state_alone(tmp_path):
         (("    horizon = 20\n", ""), r"^point has no horizon; give its class one$"),
         (("np.clip(-seen, -1, 1)", "np.zeros(3)"), r"shape \(3,\); expected \(1,\)$"),
         (("np.clip(-seen, -1, 1)", "1 / 0"), r"own\.py, line 23 \(act\): ZeroDivisionError"),
+        (("import numpy", "import numpyy"), r"own\.py, line 3 cannot be run: ModuleNotFoundError"),
+        (("return Line()", "return None"), r"^make of point returned None; expected a gymnasium"),
+        (
+            ("return self.at, {}", "return 'x', {}"),
+            r"^agent_pos of point is 'x'; expected numbers$",
+        ),
         (("class Point", "class _Point"), r"own\.py: none; expected one subclass of manip_il\.Gym"),
         (("    horizon", "    names = {'action': ('a', 'b')}\n    horizon"), r"are 2; expected 1$"),
     ],
@@ -198,6 +205,41 @@ def test_what_breaks_the_contract_is_found(tmp_path, text, what, capsys):
     assert any(
         line.startswith(f"NOT {what.partition(',')[0]}: ") for line in captured.out.splitlines()
     )
+
+
+def test_an_expert_that_raises_in_a_worker_is_told_by_file_and_line(tmp_path, capsys):
+    text = POINT.replace("return np.clip", "return [][0] if seen > 0 else np.clip")
+    (tmp_path / "own.py").write_text(text)
+    demos = f"--dataset.root={tmp_path / 'demos'}"
+    given = [f"--env.type={tmp_path / 'own.py'}", demos, "--workers=2", "--quiet"]
+    assert main(["record", *given]) == 1
+    [line] = capsys.readouterr().err.splitlines()
+    assert re.search(r"own\.py, line 23 \(act\): IndexError.*--resume=true$", line)
+
+
+def test_worlds_are_not_varied(tmp_path, capsys):
+    (tmp_path / "own.py").write_text(POINT)
+    assert main(["record", f"--env.type={tmp_path / 'own.py'}", "--vary=dynamics"]) == 2
+    assert "point cannot be varied; leave out --vary" in capsys.readouterr().err
+
+
+def test_in_python_a_world_is_made_by_its_file(tmp_path):
+    (tmp_path / "own.py").write_text(POINT)
+    env = cast("Any", manip_il.make_env(str(tmp_path / "own.py"), horizon=5))
+    env.start(1)
+    assert env.step(env.label().action).solved is False
+    assert env.spec.horizon == 5
+
+
+def test_what_is_drawn_when_an_environment_is_made_does_not_matter(tmp_path, capsys):
+    """Such as a place that every start replaces."""
+    made = "    def make(self):\n        env = gymnasium.make"
+    text = REACHER.replace("    def make(self):\n        return gymnasium.make", made)
+    first = "\n        env.unwrapped.first = np.random.rand()\n        return env\n"
+    text = text.replace('"rgb_array")\n', f'"rgb_array"){first}', 1)
+    (tmp_path / "own.py").write_text(text)
+    assert main(["env", "check", str(tmp_path / "own.py"), "--episodes=0", "--quiet"]) == 0
+    assert "NOT" not in capsys.readouterr().out
 
 
 def test_a_world_without_a_task_of_that_name_lists_its_own():

@@ -74,7 +74,7 @@ class GymEnv(Environment):
 
     def __init__(self, world: GymWorld, cameras: CameraConfig | None = None, horizon: int = 0):
         self.world, self._cameras = world, cameras
-        self.env = world.make()
+        self.env = made(world)
         self.actions = _actions(world, self.env.action_space)
         simulated = simulation(self.env)
         self._simulated, self._fresh = None, np.empty(0)
@@ -105,6 +105,8 @@ class GymEnv(Environment):
         if self._simulated:  # nothing is left of an earlier episode
             self._simulated.set(self._fresh)
         self._seen, self._info = self.world.reset(self.env, seed % _MOST_SEED)
+        if self._simulated:  # poses that belong to the state, as after it is restored
+            self._simulated.forward()
         self._count(0, 0, False)
         self._solved, self._label = False, None
 
@@ -177,10 +179,7 @@ class GymEnv(Environment):
                 f"observe of {_name(self.world)} returned {checks.shorten(found)}; expected a"
                 f" mapping with {AGENT}, {AROUND} or both"
             )
-        mine, around = (
-            np.ravel(np.asarray(found.get(key, ()), np.float32)) for key in (AGENT, AROUND)
-        )
-        return mine, around
+        return (_numbers(self.world, found, AGENT), _numbers(self.world, found, AROUND))
 
     def _checked(self, given: Any) -> Label:
         if isinstance(given, Label):
@@ -285,7 +284,7 @@ class GymKind(WorldKind):
                 f"object is {config.object}; {_name(self._cls)} has its own, so omit --task.object"
             )
         world = self._cls(task)
-        own = settings_of(world, None if world.fps and world.horizon else world.make())
+        own = settings_of(world, None if world.fps and world.horizon else made(world))
         fixed = {"control_hz": own["fps"], "tolerance": _TOLERANCE, "success_steps": 1}
         for name, value in fixed.items():
             given = getattr(config, name)
@@ -358,6 +357,16 @@ def own_kind(robot: Path | str) -> GymKind | None:
     return None
 
 
+def made(world: GymWorld) -> gymnasium.Env[Any, Any]:
+    """Return a new environment of a world. Raises `UsageError` if `make` returns something else."""
+    env: Any = world.make()
+    if not (hasattr(env, "unwrapped") and hasattr(env, "action_space")):
+        raise UsageError(
+            f"make of {_name(world)} returned {checks.shorten(env)}; expected a gymnasium.Env"
+        )
+    return env
+
+
 def settings_of(world: GymWorld, env: gymnasium.Env[Any, Any] | None) -> dict[str, Any]:
     """Return rate [Hz] and horizon of a world, from its class or its environment.
 
@@ -394,6 +403,16 @@ def _names(world: GymWorld, key: str, count: int) -> tuple[str, ...]:
     if given and len(given) != count:
         raise UsageError(f"names of {key} of {_name(world)} are {len(given)}; expected {count}")
     return given or tuple(f"{key}_{place}" for place in range(count))
+
+
+def _numbers(world: GymWorld, found: Mapping[str, Any], key: str) -> NDArray[np.float32]:
+    """Return the numbers of a key of what `observe` returned, (k,)."""
+    try:
+        return np.ravel(np.asarray(found.get(key, ()), np.float32))
+    except (TypeError, ValueError) as error:
+        raise UsageError(
+            f"{key} of {_name(world)} is {checks.shorten(found[key])}; expected numbers"
+        ) from error
 
 
 def _overrides(world: GymWorld, name: str) -> bool:

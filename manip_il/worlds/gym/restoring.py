@@ -63,9 +63,7 @@ class Simulated:
 
     def get(self) -> F64:
         """Return the state, (p,)."""
-        physics = np.empty(self._size)
-        mujoco.mj_getState(self._model, self._data, physics, WHOLE)
-        found = [physics, *(np.ravel(array) for array in self._differing.values())]
+        found = [self._physics(), *(np.ravel(array) for array in self._differing.values())]
         for place, like in self._like.items():
             value = getattr(*place)
             if place in self._may_be_none:
@@ -99,9 +97,19 @@ class Simulated:
             setattr(*place, _converted(rest[begin:end], like) if is_there else None)
             begin = end
         mujoco.mj_setState(self._model, self._data, physics, WHOLE)
+        self.forward()
+
+    def forward(self) -> None:
+        """Compute everything of MuJoCo's data that follows from the state."""
+        physics = self._physics()
         mujoco.mj_forward(self._model, self._data)
-        # again: `mj_forward` has changed where the next step's solver begins
+        # because `mj_forward` has changed where the next step's solver begins
         mujoco.mj_setState(self._model, self._data, physics, WHOLE)
+
+    def _physics(self) -> F64:
+        physics = np.empty(self._size)
+        mujoco.mj_getState(self._model, self._data, physics, WHOLE)
+        return physics
 
 
 def _converted(numbers: F64, like: Any) -> Any:

@@ -49,7 +49,8 @@ from manip_il.worlds.contract import (
 )
 from manip_il.worlds.fingerprint import environment_fingerprint
 from manip_il.worlds.ladder.expert import LadderExpert
-from manip_il.worlds.table import make_config
+from manip_il.worlds.table import make_config, world_of
+from manip_il.worlds.table import make_env as any_env
 
 
 def scene_of(robot: NameOrPath, task: NameOrPath, shape: NameOrPath = "") -> Scene:
@@ -95,16 +96,16 @@ def make_env(
     render_mode: str | None = None,
     conditions: Sequence[Condition] = (),
     **settings: Any,
-) -> ManipEnv:
-    """Return the environment of a robot and a task.
+) -> ManipEnv | Any:
+    """Return the environment of a robot and a task: a `ManipEnv`, or another world's `Environment`.
 
     Args:
-        robot: Its name, or the path of its YAML.
+        robot: Its name, or the path of its YAML, or of a world's Python file.
         task: Its name, or the path of its Python file.
         cameras: Names of the cameras rendered in every step.
         image_size: Height and width of their pictures [pixels].
         look: As in `ManipEnv`.
-        render_mode: As in `ManipEnv`.
+        render_mode: As in `ManipEnv`; other worlds have none.
         conditions: As in `ManipEnv`.
         settings: Other fields of `EnvConfig`.
 
@@ -115,6 +116,8 @@ def make_env(
     """
     config = make_config(robot, task, **settings)
     seen = CameraConfig(tuple(cameras), *image_size, look or Look()) if cameras else None
+    if world_of(config.robot) is not WORLD:
+        return any_env(config, seen, conditions)
     return ManipEnv(
         *parts_of(config),
         config,
