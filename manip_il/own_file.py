@@ -55,3 +55,8 @@ def _line(path: Path, error: BaseException) -> str:
         one.lineno for one in traceback.extract_tb(error.__traceback__) if one.filename == str(path)
     ]
     return f"{path}, line {lines[-1]}" if lines else str(path)
+
+
+def source_hash(cls: type) -> str:
+    """Return the SHA-256 of the file that a class is written in."""
+    return hashlib.sha256(Path(inspect.getfile(cls)).read_bytes()).hexdigest()

@@ -459,8 +459,13 @@ def _unknown_option(kind: str, name: str, known: Known, command: str) -> UsageEr
 
     `num_episodes` finds `dataset.num_episodes`. kind: `option`, or `key in FILE:`.
     """
-    dashes = "--" if name.startswith("--") else ""
-    labels = [dashes + key for key, one in known.items() if not one.positional]
+    labels = [
+        one.label if key == one.name else f"--{key}"
+        for key, one in known.items()
+        if not one.positional
+    ]
+    if not name.startswith("--"):
+        labels = [label.replace("--", "") for label in labels]
     near = nearest(name, labels, _MOST_OFFERED)
     return UsageError(
         f"unknown {kind} {shorten(name)}{near}; manip-il {command} --help=all lists all"

@@ -144,7 +144,7 @@ class EnvCheckOptions:
     of the state, or says that it is not. Prints its success, and the time of a step and a label.
     The exit code is 1 if a part is not kept.
 
-    Example: manip-il env check lift.py --episodes=50
+    Example: manip-il env check reacher.py
     """
 
     world: NameOrPath = option(

@@ -5,8 +5,6 @@ A file runs only if the user gives its `Path`, never because a dataset, a checkp
 names its task: what these store is a `str`, which is a name.
 """
 
-import hashlib
-import inspect
 from collections.abc import Callable
 from functools import cache
 from importlib.metadata import entry_points
@@ -83,11 +81,6 @@ def is_task(name: str) -> bool:
     """
     base = name.partition(":")[0]
     return base in TASKS or bool(entry_points(group=GROUP, name=base))
-
-
-def source_hash(task: Task) -> str:
-    """Return the SHA-256 of a task's source file."""
-    return hashlib.sha256(Path(inspect.getfile(type(task))).read_bytes()).hexdigest()
 
 
 @cache

@@ -7,7 +7,6 @@ learning". What is trained here is measured by `lerobot-eval --env.type=metaworl
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Mapping
 from functools import cache
@@ -19,6 +18,7 @@ from typing import Any, override
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.errors import ManipError
 from manip_il.mdp import F64
 from manip_il.sim.config import CameraConfig
@@ -41,7 +41,7 @@ def _known() -> dict[str, Any]:
     assert found is not None
     assert found.submodule_search_locations is not None
     [folder] = found.submodule_search_locations
-    return json.loads((Path(folder) / "metaworld_config.json").read_text())
+    return checks.read_json(Path(folder) / "metaworld_config.json", "LeRobot's table of tasks")
 
 
 class Metaworld(GymWorld):
@@ -59,7 +59,7 @@ class Metaworld(GymWorld):
 
     @override
     def make(self) -> Any:
-        metaworld = _package("metaworld")
+        metaworld, scripts = _package()
         only = metaworld.MT1(self.task, seed=SEED)
         env = only.train_classes[self.task](render_mode="rgb_array", camera_name=CAMERA)
         env.set_task(only.train_tasks[0])
@@ -68,7 +68,7 @@ class Metaworld(GymWorld):
         env._freeze_rand_vec = False
         env.seeded_rand_vec = True
         script = _known()["TASK_POLICY_MAPPING"][self.task]
-        self._script = getattr(_package("metaworld.policies"), script)()
+        self._script = getattr(scripts, script)()
         return env
 
     @override
@@ -105,11 +105,12 @@ class Metaworld(GymWorld):
 Metaworld.tasks = tuple(_known()["TASK_POLICY_MAPPING"])
 
 
-def _package(name: str) -> Any:
+def _package() -> tuple[Any, Any]:
+    """Return the package and its module of scripts."""
     # its scripts warn of commands that they expect to be clipped
     warnings.filterwarnings("ignore", module=r"metaworld\.")
     try:
-        return import_module(name)
+        return import_module("metaworld"), import_module("metaworld.policies")
     except ModuleNotFoundError as error:
         raise ManipError(
             f"metaworld needs {error.name}, which is not installed: {INSTALL}"

@@ -104,7 +104,7 @@ def stored_config(
             raises.
     """
     given = {"robot": robot, "task": task, "object": shape}
-    needed = world_of(spec.robot).own_files(spec, spec.object)
+    needed = world_of(spec.robot).own_files(spec, "")  # what a mesh needs is told better below
     if lacking := [one for one in needed if not given[FIELDS[one.partition("=")[0]]]]:
         raise UsageError(
             f"{spec.robot} {spec.task} was made with a file of your own; give {' '.join(lacking)}"

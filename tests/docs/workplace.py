@@ -109,7 +109,7 @@ class Workplace:
         What is asked of the program in the container must be words it knows.
         """
         _, _, asked = shlex.join(line.words).partition(f" {PROGRAM}")
-        if asked.strip():
+        if line.words[1] == "run" and asked.strip():
             name, own = command_of(tuple(shlex.split(asked)))
             parse(load(name), own)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import inspect
 import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -19,7 +17,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import F64, Label, Observation, State
-from manip_il.own_file import own_class
+from manip_il.own_file import own_class, source_hash
 from manip_il.robots.action_space import ActionSpace
 from manip_il.robots.spec import model_bytes
 from manip_il.sim.conditions import Condition
@@ -337,7 +335,7 @@ class GymKind(WorldKind):
         sold = [f"{name} {version(name)}" for name in packages_distributions().get(package, [])]
         simulated = simulation(env.env)
         model = model_bytes(simulated[0]) if simulated else b""
-        own = {"world_sha256": hashlib.sha256(_source(self._cls)).hexdigest()}
+        own = {"world_sha256": source_hash(self._cls)}
         return environment_fingerprint(model, settings) | own | {"package": ", ".join(sold)}
 
 
@@ -386,10 +384,6 @@ def settings_of(world: GymWorld, env: gymnasium.Env[Any, Any] | None) -> dict[st
         if not value:
             raise UsageError(f"{_name(world)} has no {name}; give its class one")
     return found
-
-
-def _source(cls: type[GymWorld]) -> bytes:
-    return Path(inspect.getfile(cls)).read_bytes()
 
 
 def _name(world: GymWorld | type[GymWorld]) -> str:

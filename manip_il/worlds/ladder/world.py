@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from manip_il.checks import check_unchanged
 from manip_il.mdp import F64, STATE_EXTRAS, State
 from manip_il.option import NameOrPath
+from manip_il.own_file import source_hash
 from manip_il.robots import ROBOTS
 from manip_il.robots.robot import ModelFiles, Robot
 from manip_il.robots.spec import model_bytes
@@ -36,7 +37,7 @@ from manip_il.sim.task import Task, phases
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks import ENV_IDS
-from manip_il.tasks.table import TASKS, get_task, is_task, source_hash
+from manip_il.tasks.table import TASKS, get_task, is_task
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.contract import (
     OPENINGS,
@@ -346,7 +347,7 @@ class LadderKind(WorldKind):
         settings |= {"reward": argument} if argument else {}
         if not config.object:  # as in fingerprints of versions that had no `object`
             del settings["object"]
-        own = {} if name in TASKS else {"task_sha256": source_hash(task)}
+        own = {} if name in TASKS else {"task_sha256": source_hash(type(task))}
         if robot.name not in ROBOTS:  # a user's own robot: hash its values, not its files' paths
             said = replace(
                 robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None)
