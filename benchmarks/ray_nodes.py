@@ -105,7 +105,7 @@ def wire(job: RolloutJob) -> float:
     with tempfile.TemporaryDirectory() as folder:
         keep = Journal(Path(folder), env_spec(job.env), env_fingerprint(job.env))
         seeds = tuple(stream_seeds("certificate", 8))
-        return len(run_there(__version__, job, seeds, keep, None, None)) / len(seeds)
+        return len(run_there(__version__, job, seeds, keep, None, None, None)) / len(seeds)
 
 
 def spread(above: list[float], below: list[float]) -> str:

@@ -129,7 +129,8 @@ def assembly(seen: F64) -> F64:
 
 def disassemble(seen: F64) -> F64:
     """Lift the wrench off the peg."""
-    hand, wrench, along = seen[:3], seen[4:7], axis(seen[7:11], 1)
+    hand, wrench = seen[:3], seen[4:7]
+    along = axis(seen[7:11], 1)
     if abs(along[0]) < 0.4:  # between the fingers it would lie lengthwise, so it is turned first
         sign = 1.0 if along[0] * along[1] >= 0 else -1.0
         aside = sign * np.array([-along[1], along[0], 0.0])
@@ -159,7 +160,8 @@ def hammer(seen: F64) -> F64:
 
 def hand_insert(seen: F64) -> F64:
     """Carry the block down into the hole."""
-    hand, block, goal = seen[:3], seen[4:7], seen[36:39]
+    hand = seen[:3]
+    block, goal = seen[4:7], seen[36:39]
     if block[2] < 0.04 and block[1] > 0.86:  # by the hole's wall, no finger fits: drag it
         top = block + 0.06 * UP
         error = hand - top
@@ -230,7 +232,8 @@ def peg_unplug(seen: F64) -> F64:
 
 def stick_push(seen: F64) -> F64:
     """Push the bottle with the stick."""
-    stick, bottle, goal = seen[4:7], seen[11:14], seen[36:39]
+    stick, bottle = seen[4:7], seen[11:14]
+    goal = seen[36:39]
     left = bottle - stick
     if abs(left[1]) + abs(left[2]) > 0.02:
         left[0] = 0
@@ -241,7 +244,8 @@ def stick_push(seen: F64) -> F64:
 
 def stick_pull(seen: F64) -> F64:
     """Put the stick through the bottle's handle and pull."""
-    stick, handle, goal = seen[4:7], seen[11:14], seen[36:39]
+    stick, handle = seen[4:7], seen[11:14]
+    goal = seen[36:39]
     left = handle - stick
     if left[0] < 0.03 and max(abs(left[1:])) < 0.04:
         left[:2] = (goal - handle)[:2]

@@ -50,7 +50,7 @@ def test_it_is_recorded_learnt_evaluated_improved_and_rendered(
     render = ["data", "render", "datasets/mine_reach", "seen", "--cameras=front"]
     assert main(render) == 2
     assert (
-        "unknown robot 'mine'; known: fetch, panda, so101, the path of a YAML"
+        "mine reach was made with a file of your own; give --robot.type=FILE.yaml"
         in capsys.readouterr().err
     )
     assert main([*render, "--robot.type=panda"]) == 1

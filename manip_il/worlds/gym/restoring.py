@@ -41,7 +41,8 @@ class Simulated:
     """
 
     def __init__(self, env: Any, model: mujoco.MjModel, data: mujoco.MjData):
-        self._env, self._model, self._data = env, model, data
+        self._env = env
+        self._model, self._data = model, data
         self._size = mujoco.mj_stateSize(model, WHOLE)
         self._first = model_arrays(model)
         self._differing: dict[str, NDArray[Any]] = {}
