@@ -162,7 +162,9 @@ def draw_until[T](draw: Callable[[], T], fits: Callable[[T], bool], world: World
 
 
 def draw_few(draw: Callable[[], F64], fits: Callable[[F64], bool]) -> F64 | None:
-    """Return the first of a few draws that fits; None if none does, and others must be redrawn."""
+    """Return the first of a few draws, (d,), that fits; None if none does, and others must be
+    redrawn.
+    """
     drawn = (draw() for _ in range(FEW_DRAWS))
     return next((place for place in drawn if fits(place)), None)
 

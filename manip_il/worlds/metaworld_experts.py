@@ -119,7 +119,7 @@ def axis(quaternion: F64, column: int) -> F64:
     )[column]
 
 
-def assembly(seen: F64) -> F64:
+def _assembly(seen: F64) -> F64:
     """Put the wrench's ring over the peg."""
     wrench = seen[4:7]
     ring = wrench + 0.13 * axis(seen[7:11], 1)
@@ -127,7 +127,7 @@ def assembly(seen: F64) -> F64:
     return grasp(seen, wrench + (-0.015, 0, 0.047), to)
 
 
-def disassemble(seen: F64) -> F64:
+def _disassemble(seen: F64) -> F64:
     """Lift the wrench off the peg."""
     hand, wrench = seen[:3], seen[4:7]
     along = axis(seen[7:11], 1)
@@ -143,13 +143,13 @@ def disassemble(seen: F64) -> F64:
     return grasp(seen, at, seen[:3] + 0.1 * UP, 0.02, 0.025)
 
 
-def basketball(seen: F64) -> F64:
+def _basketball(seen: F64) -> F64:
     """Carry the ball into the hoop."""
     ball = seen[4:7]
     return grasp(seen, ball + 0.035 * UP, over(seen, ball, seen[36:39], 0.07), 0.03)
 
 
-def hammer(seen: F64) -> F64:
+def _hammer(seen: F64) -> F64:
     """Hit the nail with the hammer's head."""
     tool = seen[4:7]
     left = np.array([0.078, 0.75, 0.125]) - tool  # its head is then where the driven nail is
@@ -158,7 +158,7 @@ def hammer(seen: F64) -> F64:
     return grasp(seen, tool + (-0.025, 0, 0.038), seen[:3] + left)
 
 
-def hand_insert(seen: F64) -> F64:
+def _hand_insert(seen: F64) -> F64:
     """Carry the block down into the hole."""
     hand = seen[:3]
     block, goal = seen[4:7], seen[36:39]
@@ -171,20 +171,20 @@ def hand_insert(seen: F64) -> F64:
     return grasp(seen, block + 0.04 * UP, over(seen, block, goal - 0.03 * UP, 0.1), 0.02, 0.03)
 
 
-def coffee(seen: F64) -> F64:
+def _coffee(seen: F64) -> F64:
     """Carry the mug to the goal, also one that has fallen."""
     mug, upright = seen[4:7], axis(seen[[10, 7, 8, 9]], 2)  # the quaternion is (x, y, z, w)
     to = seen[:3] + seen[36:39] - mug + 0.01 * UP
     return grasp(seen, mug + 0.05 * upright + 0.015 * UP, to, 0.03)
 
 
-def box_close(seen: F64) -> F64:
+def _box_close(seen: F64) -> F64:
     """Put the lid on the box."""
     lid, box = seen[4:7], seen[36:39]
     return grasp(seen, lid + 0.07 * UP, over(seen, lid, box, 0.05))
 
 
-def peg_insert(seen: F64) -> F64:
+def _peg_insert(seen: F64) -> F64:
     """Push the peg into the hole."""
     peg, goal = seen[4:7], seen[36:39]
     left = goal - (0.1, 0, 0) - peg
@@ -193,44 +193,44 @@ def peg_insert(seen: F64) -> F64:
     return grasp(seen, peg + 0.02 * UP, seen[:3] + left, 0.03)
 
 
-def carry(seen: F64) -> F64:
+def _carry(seen: F64) -> F64:
     """Carry an object straight to the goal."""
     thing = seen[4:7]
     return grasp(seen, thing + 0.03 * UP, seen[:3] + seen[36:39] - thing, 0.03)
 
 
-def bin_picking(seen: F64) -> F64:
+def _bin_picking(seen: F64) -> F64:
     """Carry the cube into the other bin."""
     cube, goal = seen[4:7], seen[36:39]
     return grasp(seen, cube + 0.04 * UP, over(seen, cube, goal, 0.15, 0.03))
 
 
-def wall(seen: F64) -> F64:
+def _wall(seen: F64) -> F64:
     """Carry the object over the wall."""
     thing, goal = seen[4:7], seen[36:39]
     return grasp(seen, thing + 0.03 * UP, over(seen, thing, goal, 0.3 - goal[2]))
 
 
-def shelf_place(seen: F64) -> F64:
+def _shelf_place(seen: F64) -> F64:
     """Put the block on the shelf."""
     block, goal = seen[4:7], seen[36:39]
     return grasp(seen, block + 0.03 * UP, over(seen, block, goal, 0.03))
 
 
-def pick_out(seen: F64) -> F64:
+def _pick_out(seen: F64) -> F64:
     """Lift the puck out of the hole."""
     puck, goal = seen[4:7], seen[36:39]
     return grasp(seen, puck + 0.03 * UP, over(seen, puck, goal, 0.0))
 
 
-def peg_unplug(seen: F64) -> F64:
+def _peg_unplug(seen: F64) -> F64:
     """Pull the peg out of its hole."""
     peg, goal = seen[4:7], seen[36:39]
     pulled = seen[:3] + np.clip(goal - peg, -0.02, 0.02)  # slowly, not to slip
     return grasp(seen, peg + (-0.035, 0, 0.015), pulled, 0.03, empty=1.01)
 
 
-def stick_push(seen: F64) -> F64:
+def _stick_push(seen: F64) -> F64:
     """Push the bottle with the stick."""
     stick, bottle = seen[4:7], seen[11:14]
     goal = seen[36:39]
@@ -242,7 +242,7 @@ def stick_push(seen: F64) -> F64:
     return grasp(seen, stick + (0.015, 0, 0.03), seen[:3] + left)
 
 
-def stick_pull(seen: F64) -> F64:
+def _stick_pull(seen: F64) -> F64:
     """Put the stick through the bottle's handle and pull."""
     stick, handle = seen[4:7], seen[11:14]
     goal = seen[36:39]
@@ -254,12 +254,12 @@ def stick_pull(seen: F64) -> F64:
     return grasp(seen, stick + (-0.015, 0, 0.035), seen[:3] + left)
 
 
-def handle_pull_side(seen: F64) -> F64:
+def _handle_pull_side(seen: F64) -> F64:
     """Pull the handle up."""
     return grasp(seen, seen[4:7], seen[:3] + 0.1 * UP, 0.03, 0.03)
 
 
-def door_open(seen: F64) -> F64:
+def _door_open(seen: F64) -> F64:
     """Pull the door open by its handle, from behind it."""
     hand, handle = seen[:3], seen[4:7]
     behind = handle + (0.01, 0.02, 0)
@@ -271,28 +271,28 @@ def door_open(seen: F64) -> F64:
 
 
 EXPERTS: dict[str, Callable[[F64], F64]] = {
-    "assembly-v3": assembly,
-    "basketball-v3": basketball,
-    "bin-picking-v3": bin_picking,
-    "box-close-v3": box_close,
-    "coffee-pull-v3": coffee,
-    "coffee-push-v3": coffee,
-    "disassemble-v3": disassemble,
-    "door-open-v3": door_open,
-    "hammer-v3": hammer,
-    "hand-insert-v3": hand_insert,
-    "handle-pull-side-v3": handle_pull_side,
-    "peg-insert-side-v3": peg_insert,
-    "peg-unplug-side-v3": peg_unplug,
-    "pick-out-of-hole-v3": pick_out,
-    "pick-place-v3": carry,
-    "pick-place-wall-v3": wall,
-    "push-v3": carry,
-    "push-wall-v3": wall,
-    "push-back-v3": carry,
-    "shelf-place-v3": shelf_place,
-    "stick-pull-v3": stick_pull,
-    "stick-push-v3": stick_push,
-    "sweep-v3": carry,
-    "sweep-into-v3": carry,
+    "assembly-v3": _assembly,
+    "basketball-v3": _basketball,
+    "bin-picking-v3": _bin_picking,
+    "box-close-v3": _box_close,
+    "coffee-pull-v3": _coffee,
+    "coffee-push-v3": _coffee,
+    "disassemble-v3": _disassemble,
+    "door-open-v3": _door_open,
+    "hammer-v3": _hammer,
+    "hand-insert-v3": _hand_insert,
+    "handle-pull-side-v3": _handle_pull_side,
+    "peg-insert-side-v3": _peg_insert,
+    "peg-unplug-side-v3": _peg_unplug,
+    "pick-out-of-hole-v3": _pick_out,
+    "pick-place-v3": _carry,
+    "pick-place-wall-v3": _wall,
+    "push-v3": _carry,
+    "push-wall-v3": _wall,
+    "push-back-v3": _carry,
+    "shelf-place-v3": _shelf_place,
+    "stick-pull-v3": _stick_pull,
+    "stick-push-v3": _stick_push,
+    "sweep-v3": _carry,
+    "sweep-into-v3": _carry,
 }

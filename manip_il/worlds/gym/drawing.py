@@ -74,7 +74,8 @@ def painted(
     camera: str,
     cameras: CameraConfig,
 ) -> NDArray[np.uint8]:
-    """Return a picture of a simulation, drawn from a copy of its model with fewer faces.
+    """Return a picture of a simulation, (height, width, 3), drawn from a copy of its model with
+    fewer faces.
 
     Args:
         cls: The world.

@@ -121,7 +121,9 @@ def _converted(numbers: F64, like: Any) -> Any:
 
 
 def model_arrays(model: mujoco.MjModel) -> dict[str, NDArray[Any]]:
-    """Return copies of a model's arrays of numbers that are not large: name -> array."""
+    """Return copies of a model's arrays of numbers that are not large: name -> array, of any shape
+    (...,).
+    """
     found = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
     return {
         name: value.copy()

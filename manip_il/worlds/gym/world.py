@@ -91,7 +91,8 @@ class GymWorld:
             seen: The observation that its last `step` or `reset` returned.
 
         Returns:
-            An action, or a `Label`, which can also say that there is no sound action and why.
+            An action, (n,), or a `Label`, which can also say that there is no sound action, and
+            why.
         """
         raise NotImplementedError
 
