@@ -63,6 +63,7 @@ def test_a_new_file_starts_between_episodes(tmp_path, make_episode, two):
     assert_comes_back(tmp_path / "small", episodes)
 
 
+@pytest.mark.system
 def test_timestamps_are_exact(root, two):
     path = next(iter(video_rows(root)))
     with closing(av.open(str(path))) as container:

@@ -52,6 +52,7 @@ def file(report: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return report.write(tmp_path_factory.mktemp("report"))
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("width", [1280, 390])
 def test_it_opens_quietly_and_fits_the_window(
     browser: Browser, report: Report, file: Path, width: int

@@ -20,6 +20,8 @@ from manip_il.worlds.ladder.world import scene_of
 
 from ..scenes import SEED, started
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture
 def env(request) -> ManipEnv:

@@ -44,7 +44,10 @@ def bucket(s3: dict[str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     return f"s3://bucket{tmp_path}"
 
 
-@pytest.fixture(params=["file", "s3", pytest.param("sftp", marks=pytest.mark.slow), "hub"])
+SFTP = pytest.param("sftp", marks=[pytest.mark.slow, pytest.mark.system])
+
+
+@pytest.fixture(params=["file", "s3", SFTP, "hub"])
 def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A URL where nothing is yet, on each kind of remote."""
     if request.param == "sftp":
