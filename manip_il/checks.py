@@ -34,6 +34,7 @@ MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
+_BETWEEN_TASKS = re.compile(r",(?!\w+=)", re.ASCII)
 _NUMBERS = re.compile(r"\w+=[0-9.e+-]+(,\w+=[0-9.e+-]+)*", re.ASCII)
 _SURROGATE = re.compile("[\ud800-\udfff]")  # not Unicode on its own, so that no file can hold it
 _LONGEST_MESSAGE = 1_000  # [characters]
@@ -63,12 +64,24 @@ def name(what: str, value: object) -> str:
     return value
 
 
+def tasks_in(text: str) -> tuple[str, ...]:
+    """Return the names in `lift,carry:A=1,B=2,stack`, where commas also stand between the numbers
+    of one task; each name once.
+    """
+    return tuple(dict.fromkeys(_BETWEEN_TASKS.split(text)))
+
+
 def task_name(value: object) -> str:
-    """Return a task's name, checked as by `name`.
+    """Return the name of a task, or of several with commas between them, checked as by `name`.
 
     Numbers may follow a colon: `NAME:A=NUMBER,B=NUMBER`.
     """
-    base, colon, numbers = text("task", value).partition(":")
+    names = tasks_in(text("task", value))
+    return ",".join(map(_task_name, names))
+
+
+def _task_name(value: str) -> str:
+    base, colon, numbers = value.partition(":")
     if colon and not _NUMBERS.fullmatch(numbers):
         raise ManipError(f"task is {shorten(value)}; expected NAME=NUMBER,... after the colon")
     name("task", base)

@@ -41,7 +41,7 @@ from manip_il.collect.drivers import Driver, PolicyDriver
 from manip_il.collect.edits import CHUNK, EditSource, EditTarget, redraw_dataset
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import Query
-from manip_il.collect.record import MAX_TRIES, collect, collect_successes, provenance
+from manip_il.collect.record import collect, demonstrate, provenance, seeds_by_task
 from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.atomic import CHECKPOINT, append_line, new_folder, read_lines
 from manip_il.data.build import Recording
@@ -54,6 +54,7 @@ from manip_il.progress import Progress
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.events import standard_in
+from manip_il.worlds.table import task_names
 
 BEST = "best"
 HELD_OUT = "held_out"
@@ -130,9 +131,14 @@ class Run:
             if not (here / DATASET).is_dir():
                 job = round_job(config, round_)
                 stream = f"round/{round_}" if round_ else "demonstrations"
-                seeds = stream_seeds(stream, MAX_TRIES * count, config.seed)
-                episodes = collect_successes(
-                    self._engine, job, seeds, count, here / JOURNALS, self._progress.episode
+                episodes = demonstrate(
+                    self._engine,
+                    job,
+                    stream,
+                    count,
+                    here / JOURNALS,
+                    self._progress,
+                    config.seed,
                 )
                 recording = Recording(True, count, provenance(job), labels=self._budget(round_))
                 record_round(here, job, episodes, recording)
@@ -188,7 +194,7 @@ class Run:
                 if job.labels_all:
                     job = replace(job, patience=config.patience)
                 hard = replace(job, conditions=(standard_in(job.conditions),))
-                seeds = stream_seeds(f"round/{round_}", count, config.seed)
+                seeds = self._seeds(round_)
                 first = round(disturbed * count)
                 episodes = itertools.chain.from_iterable(
                     collect(self._engine, one, part, here / JOURNALS, self._progress.episode)
@@ -278,6 +284,24 @@ class Run:
         """Copy the best policy's `pretrained_model` to `best`."""
         with new_folder(self.folder / BEST, replaces=CHECKPOINT) as new:
             shutil.copytree(policy, new / PRETRAINED_MODEL)
+
+    def _seeds(self, round_: int) -> list[int]:
+        """Return the seeds of a round's rollouts.
+
+        With several tasks, each gets rollouts in proportion to its estimated share of failures: (f
+        + 1) / (n + 2) if f of n episodes of the last validation failed (Laplace's rule of
+        succession).
+        """
+        config, validated = self.config, self._folder(round_ - 1) / FILE_NAME
+        parts = EvalResult.read(validated).by_task if validated.is_file() else {}
+        outcomes = [
+            [one.success for one in parts[str(name)].episodes] if name in parts else []
+            for name in task_names(config.env)
+        ]
+        weights = [(one.count(False) + 1) / (len(one) + 2) for one in outcomes]
+        stream, count = f"round/{round_}", config.episodes_per_round
+        found = seeds_by_task(config.env, stream, count, config.seed, weights=weights)
+        return sorted(seed for seeds, number in found for seed in seeds[:number])
 
     def _folder(self, round_: int) -> Path:
         return round_folder(self.folder, round_)

@@ -118,7 +118,7 @@ class ActorCritic(nn.Module):
 
     def gaussian(self, obs: Tensor) -> Normal:
         """Return the distribution of the actions, (B, n)."""
-        mean = self.actor.layers(self.actor.encode(obs[:, :-EXTRA]))
+        mean = self.actor.outputs(obs[:, :-EXTRA])
         return Normal(mean, floored_log_std(self.head.raw_log_std).exp(), validate_args=False)
 
     @property

@@ -58,7 +58,7 @@ def own_files(spec: Any, shape: str = "") -> list[str]:
     """
     if spec.task == UNKNOWN_TASK:
         return []
-    return world_of(spec.robot).own_files(spec, shape)
+    return world_of(spec.robot, spec.task).own_files(spec, shape)
 
 
 def path_options(env: Mapping[str, Any]) -> list[str]:
@@ -87,7 +87,7 @@ def differences(dataset: Dataset) -> list[str]:
     is not compared, because it holds only the name of that arm or task.
     """
     spec, name = dataset.spec, str(dataset.root)
-    if world_of(spec.robot).own_files(spec, spec.object):
+    if world_of(spec.robot, spec.task).own_files(spec, spec.object):
         return []
     env = stored_config(spec)
     check_same_spec(name, spec, "this program", env_spec(env))

@@ -35,7 +35,8 @@ from manip_il.progress import Progress
 from manip_il.seeding import BLOCK, stream_seeds
 from manip_il.sim.config import Look
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.table import env_fingerprint, env_of_name, env_spec
+from manip_il.worlds.several import divide, task_number
+from manip_il.worlds.table import env_fingerprint, env_of_name, env_spec, task_names
 
 OnEpisode = Callable[[Episode], None]
 MAX_TRIES = 3  # most tries, as a multiple of the requested successes
@@ -124,6 +125,66 @@ def collect_successes(
         for journal, episode in collect(engine, job, more, journals, on_episode):
             good += episode.success
             yield journal, episode
+
+
+def demonstrate(
+    engine: Engine,
+    job: RolloutJob,
+    stream: str,
+    count: int,
+    journals: Path,
+    progress: Progress,
+    seed: int = 0,
+) -> Iterator[tuple[Journal, Episode]]:
+    """Run the expert until it has succeeded in `count` episodes, in equally many of each task.
+
+    Args:
+        engine: Runs the episodes.
+        job: The job of the episodes.
+        stream: Name of the stream of seeds.
+        count: Number of successes wanted.
+        journals: Folder of the journals.
+        progress: Follows the episodes.
+        seed: The user's `--seed`.
+
+    Yields:
+        What `collect_successes` yields.
+    """
+    for seeds, number in seeds_by_task(job.env, stream, count, seed, tries=MAX_TRIES):
+        yield from collect_successes(engine, job, seeds, number, journals, progress.episode)
+
+
+def seeds_by_task(
+    env: EnvConfig,
+    stream: str,
+    count: int,
+    seed: int = 0,
+    *,
+    tries: int = 1,
+    weights: Sequence[float] = (),
+) -> list[tuple[Sequence[int], int]]:
+    """Divide episodes among the tasks of an environment.
+
+    Args:
+        env: The environment.
+        stream: Name of the stream of seeds.
+        count: Number of episodes.
+        seed: The user's `--seed`.
+        tries: Seeds to choose from, as a multiple of the episodes.
+        weights: How many episodes each task gets, relative to the others; by default equally many.
+
+    Returns:
+        For each task, its seeds and its number of episodes; tasks without episodes are left out.
+    """
+    tasks = len(task_names(env))
+    if tasks == 1:
+        return [(stream_seeds(stream, tries * count, seed), count)]
+    numbers = divide(count, weights or [1.0] * tasks)
+    enough = min(BLOCK, tries * tasks * max(numbers))
+    by_task: list[list[int]] = [[] for _ in numbers]
+    for one in stream_seeds(stream, enough, seed):
+        by_task[task_number(one, tasks)].append(one)
+    return [(seeds, number) for seeds, number in zip(by_task, numbers, strict=True) if number]
 
 
 def provenance(job: RolloutJob) -> dict[str, Any]:
@@ -230,8 +291,7 @@ def record(
     progress.start(f"record {job.env.robot} {job.env.task}", max(0, episodes - done))
     with engine_of(workers) as engine:
         if policy is None:
-            seeds = stream_seeds("demonstrations", MAX_TRIES * episodes, seed)
-            made = collect_successes(engine, job, seeds, episodes, journals, progress.episode)
+            made = demonstrate(engine, job, "demonstrations", episodes, journals, progress, seed)
         else:
             seeds = stream_seeds(f"round/{job.round}", episodes, seed)
             made = collect(engine, job, seeds, journals, progress.episode)

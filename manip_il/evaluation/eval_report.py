@@ -26,7 +26,7 @@ def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = 
         no_films: Why there are no films; empty if there are films, or none were asked for.
     """
     settings, success = result.settings, result.success
-    solved = world_of(result.robot).success(settings.tolerance, settings.success_steps)
+    solved = world_of(result.robot, result.task).success(settings.tolerance, settings.success_steps)
     end = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
     note = f"Episodes have at most {settings.horizon:,} control steps. Success: {solved}{end}."
     if result.until_width is not None:
@@ -137,13 +137,15 @@ def run_report(
 
 def condition_sides(result: EvalResult) -> list[Side]:
     """Return an evaluation as the sides of a report: all episodes and, if there are several,
-    each condition's.
+    each task's and each condition's.
     """
-    conditions = result.by_condition
-    if len(conditions) < 2:
+    conditions = result.by_condition if len(result.by_condition) > 1 else {}
+    named = result.by_task | {name or "without a condition": of for name, of in conditions.items()}
+    if not named:
         return [Side.of(result.policy, result)]
-    parts = [Side.of(name or "without a condition", part) for name, part in conditions.items()]
-    return [Side.of("all conditions", result, colour=BASELINE), *parts]
+    parts = [Side.of(name, part) for name, part in named.items()]
+    whole = "all conditions" if conditions else "all tasks"
+    return [Side.of(whole, result, colour=BASELINE), *parts]
 
 
 def success_table(sides: Sequence[Side]) -> Table:

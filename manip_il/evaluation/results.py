@@ -84,6 +84,7 @@ class EpisodeResult:
         detail = dict(data)
         values: list[Any] = [convert(detail.pop(key)) for key, convert in _KEYS.items()]
         checks.text("condition", detail.get("condition", ""))
+        checks.text("task", detail.get("task", ""))
         checks.mapping("drawn", detail.get("drawn", {}))
         checks.number("steps_to_success", detail.get("steps_to_success") or 0)
         return cls(*values, detail=detail)
@@ -258,6 +259,18 @@ class EvalResult:
             if episodes
         }
 
+    @cached_property
+    def by_task(self) -> dict[str, EvalResult]:
+        """Task -> its episodes; {} if there is only one task."""
+        parts: dict[str, list[EpisodeResult]] = {}
+        for episode in self.episodes:
+            parts.setdefault(episode.detail.get("task", ""), []).append(episode)
+        return {
+            name: replace(self, episodes=tuple(episodes))
+            for name, episodes in sorted(parts.items())
+            if name
+        }
+
     @property
     def steps_to_success(self) -> float | None:
         """Mean control steps until the first success, over successful episodes.
@@ -294,6 +307,7 @@ class EvalResult:
             "by_condition": {
                 name: part.success.to_json() for name, part in self.by_condition.items() if name
             },
+            "by_task": {name: part.success.to_json() for name, part in self.by_task.items()},
             "policy": self.policy,
             "policy_sha256": self.policy_sha256,
             "robot": self.robot,

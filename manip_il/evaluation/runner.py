@@ -22,7 +22,8 @@ from manip_il.progress import Progress
 from manip_il.sim.conditions import NOMINAL, draw, turn_of
 from manip_il.sim.world import World
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.table import described_env, env_fingerprint, env_spec
+from manip_il.worlds.several import task_number
+from manip_il.worlds.table import described_env, env_fingerprint, env_spec, task_names
 
 CHECK_EVERY = 100  # number of episodes between checks of the interval's width
 EPISODES_FILE = "episodes.jsonl"
@@ -113,6 +114,8 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     phase = int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])
     if phase == 0 and episode.success_at_end:  # the expert is not queried in a solved state
         phase = -1
+    tasks = task_names(job.env)
+    task = str(tasks[task_number(episode.seed, len(tasks))])
     return EpisodeResult(
         seed=episode.seed,
         success=episode.success,
@@ -120,7 +123,8 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
         steps=len(episode),
         ret=float(episode.columns[schema.REWARD].sum()),
         phase_at_end=env_spec(job.env).phases[phase],
-        detail={
+        detail=({"task": task} if len(tasks) > 1 else {})
+        | {
             "steps_to_success": int(solved[0]) + 1 if solved.size else None,
             "condition": turn_of(job.conditions, episode.seed).name,
             "drawn": draw(job.conditions, episode.seed, job.env.object),

@@ -36,7 +36,7 @@ def suite_conditions(suite: str, env: EnvConfig, *, sees: bool) -> tuple[Conditi
         UsageError: if the file is invalid, or if no condition is left.
     """
     asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
-    world = world_of(env.robot)
+    world = world_of(env.robot, env.task)
     affecting = (world.affecting(env, condition, sees=sees) for condition in asked)
     left = tuple(condition for condition in affecting if condition is not None)
     if not left:
@@ -69,7 +69,7 @@ def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Conditi
     ):
         raise UnknownName("--vary", odd, CONDITIONS[1:])
     asked = merged([read_condition(name) for name in names])
-    kept = world_of(env.robot).affecting(env, asked, sees=sees)
+    kept = world_of(env.robot, env.task).affecting(env, asked, sees=sees)
     if kept is None:
         env_spec(env).require("varied", "leave out --vary")
         raise UsageError(

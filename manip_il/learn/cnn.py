@@ -24,7 +24,8 @@ from manip_il.learn.mlp import MLPConfig, MLPPolicy, labelled, table_of
 from manip_il.learn.mlp import make_mlp_pre_post_processors as make_cnn_pre_post_processors
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork, NetworkConfig, fit_statistics, inverse, perceptron
-from manip_il.learn.samples import Table
+from manip_il.learn.samples import TASK, Table
+from manip_il.learn.texts import LENGTH, TextReader
 from manip_il.option import bounded, option
 
 _MOST_LAYERS = 16
@@ -105,6 +106,8 @@ class CNNConfig(MLPConfig):
     def validate_features(self) -> None:
         """Raise unless there are `observation.state`, `action` of the same size, and pictures."""
         super().validate_features()
+        if self.states and self.reads_text:
+            raise UsageError("policy.states cannot be combined with several tasks")
         if self.states and self.action_space == EE_DELTA:
             raise UsageError(
                 f"policy.states cannot be combined with {EE_DELTA}; expected {JOINT_DELTA}"
@@ -144,7 +147,7 @@ class CNNPolicy(MLPPolicy):
         # The last bits of a convolution depend on the batch size, so one row at a time. Half
         # precision is for training.
         with torch.autocast(state.device.type, enabled=False):
-            keys = (*self.inputs, *self.cameras)
+            keys = [*self.inputs, *self.cameras, *([TASK] if TASK in batch else [])]
             rows = [
                 self.network_inputs({key: batch[key][i : i + 1] for key in keys})
                 for i in range(len(state))
@@ -171,6 +174,9 @@ class CNNPolicy(MLPPolicy):
         self.encoders = nn.ModuleList(
             [KeypointEncoder(config.channels, config.keypoints) for _ in self.cameras]
         )
+        self.reader = None
+        if config.reads_text:
+            self.reader = TextReader([*config.channels] * len(self.cameras))
         seen = sum(features[key].shape[0] for key in self.inputs)
         self.seen_size = seen + NUMBERS * config.keypoints * len(self.cameras)
         self.privileged = None
@@ -187,6 +193,7 @@ class CNNPolicy(MLPPolicy):
             # the cnn scales the offsets itself
             width, scaled = self.seen_size + size, {"scales": ()}
             width += len(config.scales) * len(self.offsets)
+        width += LENGTH if config.reads_text else 0
         self.model = MLPNetwork(width, self._numbers_out(), NetworkConfig.of(vars(config) | scaled))
 
     @override
@@ -197,9 +204,12 @@ class CNNPolicy(MLPPolicy):
         With the option `states`, return only joint state and predicted state.
         """
         config = self.config
+        texts = self.texts(batch)
+        changes = self.reader(*texts) if self.reader else []
+        layers = len(config.channels)
         keypoints = [
-            encoder(self._at_size(key, batch))
-            for encoder, key in zip(self.encoders, self.cameras, strict=True)
+            encoder(self._at_size(key, batch), changes[number * layers : (number + 1) * layers])
+            for number, (encoder, key) in enumerate(zip(self.encoders, self.cameras, strict=True))
         ]
         seen = torch.cat([*(batch[key] for key in self.inputs), *keypoints], dim=-1)
         parts = [seen]
@@ -217,7 +227,7 @@ class CNNPolicy(MLPPolicy):
                     return torch.cat([batch[STATE], around], dim=-1)
             if around is not None and self.offsets:
                 parts += [torch.tanh(around[:, self.offsets] / scale) for scale in config.scales]
-            return torch.cat(parts, dim=-1)
+            return torch.cat([*parts, *texts], dim=-1)
 
     def _at_size(self, key: str, batch: dict[str, Tensor]) -> Tensor:
         """Return a camera's pictures (B, 3, H, W) at the size used in training, reduced by
@@ -344,15 +354,22 @@ class KeypointEncoder(nn.Module):
                 nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
                 nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
 
-    def forward(self, pictures: Tensor) -> Tensor:
-        """Return the numbers of the keypoints, (B, 4 K) in single precision, for pictures (B, 3,
-        H, W) from 0 to 1.
+    def forward(self, pictures: Tensor, changes: Sequence[tuple[Tensor, Tensor]] = ()) -> Tensor:
+        """Return the numbers of the keypoints, (B, 4 K) in single precision.
+
+        Args:
+            pictures: Pictures (B, 3, H, W), from 0 to 1.
+            changes: Factor and shift of each layer's channels, (B, C) each; empty for none.
         """
         # Channels-last is faster on a CPU. The weights stay contiguous, as safetensors needs for an
         # optimiser's state.
-        features = self.layers(
-            _light_and_colour(pictures).contiguous(memory_format=torch.channels_last)
-        )
+        features = _light_and_colour(pictures).contiguous(memory_format=torch.channels_last)
+        for number in range(len(self.layers) // 2):
+            features = self.layers[2 * number](features)
+            if changes:
+                factor, shift = (one[..., None, None].to(features) for one in changes[number])
+                features = features * factor + shift
+            features = self.layers[2 * number + 1](features)
         # In half precision a keypoint would jump from pixel to pixel.
         with torch.autocast(pictures.device.type, enabled=False):
             return self._keypoints(features.float())

@@ -84,6 +84,10 @@ def export_onnx(checkpoint: Checkpoint | Path) -> tuple[bytes, float]:
             f"{path} was trained with {EE_DELTA}, whose inverse kinematics cannot be exported;"
             f" train with {JOINT_DELTA}"
         )
+    if checkpoint.config.get("reads_text"):
+        raise ManipError(
+            f"{path} reads the task's text, which the file would not; train a policy on one task"
+        )
     function = PolicyFunction(policy)
     states, around, images = _random_observations(function.network, checkpoint)
     pictures = {IMAGES + camera: picture for camera, picture in images.items()}

@@ -24,7 +24,8 @@ from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.names import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork, NetworkConfig
-from manip_il.learn.samples import Table, label_valid
+from manip_il.learn.samples import TASK, Table, label_valid
+from manip_il.learn.texts import LENGTH, tokens
 
 __path__: list[str] = []
 
@@ -114,6 +115,7 @@ class MLPPolicy(PreTrainedPolicy):
             `training_table`. The statistics are then computed from the frames with a valid label.
     """
 
+    config: Any  # `MLPConfig`, or that of a subclass
     config_class = MLPConfig  # type: ignore[assignment]
     name = "mlp"  # type: ignore[assignment]
     target_range: tuple[Tensor, Tensor]  # (low, high) in the training data
@@ -124,6 +126,8 @@ class MLPPolicy(PreTrainedPolicy):
         self.inputs = [
             key for key in (STATE, ENVIRONMENT_STATE) if key in (config.input_features or {})
         ]
+        if config.reads_text is None:
+            config.reads_text = dataset_meta is not None and len(dataset_meta.tasks) > 1
         if config.scales and not config.scaled and dataset_meta is not None:
             reads = ENVIRONMENT_STATE in self.inputs or getattr(config, "aux_weight", 0) > 0
             config.scaled = self._offsets(offsets_of(dataset_meta.features if reads else {}))
@@ -163,6 +167,7 @@ class MLPPolicy(PreTrainedPolicy):
         features = config.input_features or {}
         config.input_features = {key: features[key] for key in self.inputs}
         width = sum(features[key].shape[0] for key in self.inputs)
+        width += LENGTH if config.reads_text else 0
         self.model = MLPNetwork(width, self._numbers_out(), config)
 
     def _numbers_out(self) -> int:
@@ -176,7 +181,17 @@ class MLPPolicy(PreTrainedPolicy):
 
     def network_inputs(self, batch: dict[str, Tensor]) -> Tensor:
         """Return the network's inputs (B, d) for a batch of observations."""
-        return torch.cat([batch[key] for key in self.inputs], dim=-1)
+        parts = [batch[key] for key in self.inputs]
+        return torch.cat([*parts, *self.texts(batch)], dim=-1)
+
+    def texts(self, batch: Mapping[str, Any]) -> list[Tensor]:
+        """Return the network's inputs for the texts of a batch, one array (B, `LENGTH`); [] if it
+        reads none.
+        """
+        if not self.config.reads_text:
+            return []
+        state = batch[STATE]
+        return [tokens(batch.get(TASK) or [""] * len(state)).to(state.device)]
 
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
         return self.model.row_losses(inputs, batch[ACTION])

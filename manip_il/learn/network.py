@@ -23,6 +23,7 @@ from manip_il.learn.action_spaces import LAST
 from manip_il.learn.checkpoint import MOST_VALUES, WEIGHTS, in_one_line
 from manip_il.learn.losses import LOSSES, make_head
 from manip_il.learn.names import ACTION_SPACES, JOINT_DELTA
+from manip_il.learn.texts import LENGTH, TextReader
 from manip_il.mdp import F32, F64
 from manip_il.option import check_bounds, option
 
@@ -57,6 +58,8 @@ class NetworkConfig:
         scaled: Indices of these offsets, taken from the dataset.
         grippers: Indices of the gripper openings, which are absolute in `joint_delta`, taken from
             the robot.
+        reads_text: Whether the network reads the task's text; None if it does where the dataset has
+            several.
 
     Raises:
         UnknownName: The loss, the activation or the action space is unknown.
@@ -75,6 +78,7 @@ class NetworkConfig:
     scales: tuple[float, ...] = ()
     scaled: tuple[int, ...] = ()
     grippers: tuple[int, ...] = LAST
+    reads_text: bool | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self, "policy.")
@@ -171,7 +175,8 @@ def perceptron(
 class MLPNetwork(nn.Module):
     """Perceptron, head and normalisation.
 
-    Inputs (B, n + k) are raw; the first n are the measured joints.
+    Inputs (B, n + k) are raw; the first n are the measured joints. If the network reads texts, the
+    last columns are those of `manip_il.learn.texts.tokens`, (B, n + k + `LENGTH`).
 
     In the space `joint_delta` the targets of arm joints are relative to the measured joints, which
     the network adds itself; the targets of grippers are absolute. In all other spaces it returns
@@ -204,6 +209,9 @@ class MLPNetwork(nn.Module):
         self.scales = config.scales
         self.scaled = list(config.scaled)
         self.inputs = inputs
+        self.reader = TextReader([config.width] * config.depth) if config.reads_text else None
+        inputs -= LENGTH if config.reads_text else 0
+        self.numbers = inputs
         inputs += len(self.scales) * len(self.scaled)
         self.head = make_head(
             config.loss, n, components=config.components, bins=config.bins, sigma=config.sigma
@@ -230,9 +238,10 @@ class MLPNetwork(nn.Module):
         self.set_statistics(fit_statistics(self.expanded(inputs).numpy(), targets, self.loss))
 
     def expanded(self, inputs: Tensor) -> Tensor:
-        """Return inputs (B, n + k) with tanh(offset / scale) appended for each scale, so that
-        millimetres matter.
+        """Return the numbers among the inputs, (B, n + k), with tanh(offset / scale) appended for
+        each scale, so that millimetres matter.
         """
+        inputs = inputs[:, : self.numbers]
         if not self.scales:
             return inputs
         return torch.cat(
@@ -257,7 +266,20 @@ class MLPNetwork(nn.Module):
         n).
         """
         targets = self.encode_targets(self.relative(actions, inputs))
-        return self.head.nll(self.layers(self.encode(inputs)), targets)
+        return self.head.nll(self.outputs(inputs), targets)
+
+    def outputs(self, inputs: Tensor) -> Tensor:
+        """Return the perceptron's outputs, (B, h), for raw inputs (B, n + k), which its head turns
+        into targets.
+        """
+        if self.reader is None:
+            return self.layers(self.encode(inputs))
+        hidden = self.encode(inputs)
+        changes = self.reader(inputs[:, self.numbers :])
+        for number, (factor, shift) in enumerate(changes):
+            linear, activation = self.layers[2 * number], self.layers[2 * number + 1]
+            hidden = activation(linear(hidden) * factor + shift)
+        return self.layers[-1](hidden)
 
     def relative(self, actions: Tensor, inputs: Tensor) -> Tensor:
         """Return absolute actions (B, n) minus the measured joints that the network adds to its
@@ -278,7 +300,7 @@ class MLPNetwork(nn.Module):
 
         The last bits depend on the number of rows.
         """
-        y = self.head.action(self.layers(self.encode(inputs)))
+        y = self.head.action(self.outputs(inputs))
         # The expert's targets never left this range, so the learner's must not either.
         target = torch.clamp(
             y * self.target_scale + self.target_mean, self.target_low, self.target_high

@@ -17,6 +17,7 @@ from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import CONFIG, Checkpoint, in_one_line
 from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
 from manip_il.learn.network import MLPNetwork, NetworkConfig, read_weights, require_device, threads
+from manip_il.learn.texts import LENGTH, tokens
 from manip_il.mdp import F32, F64, I64, Images
 
 if TYPE_CHECKING:  # `episode_policy` imports LeRobot, which takes seconds
@@ -65,7 +66,7 @@ class LearnedPolicy:
         require_device(device)
         opened = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint.open(checkpoint)
         if opened.kind == MLP:
-            return cls(_Perceptron(opened, device), opened)
+            return cls(_Perceptron(opened, device, task), opened)
         from manip_il.learn.episode_policy import EpisodePolicy
 
         return cls(EpisodePolicy(opened, device, task, trust), opened)
@@ -175,16 +176,20 @@ def actions_along(
 
 
 class _Perceptron:
-    """The mlp: no memory, and one call for all rows, whose actions are independent of each
-    other.
+    """The mlp: no memory except of texts, and one call for all rows, whose actions are
+    independent of each other.
     """
 
-    def __init__(self, checkpoint: Checkpoint, device: str):
+    def __init__(self, checkpoint: Checkpoint, device: str, task: str):
         self._device = device
         self._keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in checkpoint.numbers]
         width = sum(checkpoint.numbers[key] for key in self._keys)
+        config = NetworkConfig.of(checkpoint.config)
+        width += LENGTH if config.reads_text else 0
+        self._reads, self._task = bool(config.reads_text), task
+        self._texts: dict[int, str] = {}
         with in_one_line(f"{checkpoint.path}: weights and {CONFIG} do not match"):
-            self.module = MLPNetwork(width, checkpoint.action, NetworkConfig.of(checkpoint.config))
+            self.module = MLPNetwork(width, checkpoint.action, config)
             self.module.load_state_dict(read_weights(checkpoint.path))
         self.module.to(device).eval()
         # the network converts joint_delta
@@ -197,9 +202,14 @@ class _Perceptron:
         The mlp's processors are the identity (see MLPConfig), except for the conversion of an
         action space.
         """
-        inputs = torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)
+        parts = [batch[key] for key in self._keys]
+        if self._reads:
+            self._texts = {one: self._texts.get(one, "") for one in episodes}
+            parts.append(tokens([self._texts[one] or self._task for one in episodes]))
+        inputs = torch.cat(parts, dim=1).to(self._device)
         targets = self.module.act(inputs).cpu().numpy()
         return torch.from_numpy(self._decode(targets, batch[STATE].numpy()))
 
     def begin(self, instructions: Mapping[int, str]) -> None:
-        """Do nothing: the mlp has no memory, and does not read language."""
+        """Keep the texts of episodes that begin; there is no other memory."""
+        self._texts |= instructions

@@ -105,7 +105,7 @@ class Trainer:
         self.output_dir = output_dir
         self.datasets = datasets
         specs = {dataset.root: dataset.spec for dataset in datasets}
-        language = config.kind not in PLAIN
+        language = config.kind not in PLAIN or config.kind in OWN_SPACE
         check_same_sources(specs, pictures=config.takes_images, language=language)
         check_shares(shares, datasets)
         spec = datasets[0].spec

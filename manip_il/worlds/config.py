@@ -82,4 +82,5 @@ class EnvConfig(Episodes):
         """Robot and task joined by "_": a file by its name without the suffix, a task without
         its argument.
         """
-        return f"{Path(self.robot).stem}_{Path(self.task).stem.partition(':')[0]}"
+        task = Path(self.task).stem.partition(":")[0].replace(",", "+")
+        return f"{Path(self.robot).stem}_{task}"

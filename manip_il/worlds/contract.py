@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import F64, IMAGES, KEYPOINTS, Label, Observation, State
+from manip_il.option import NameOrPath
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, require_cameras
@@ -271,6 +272,10 @@ class Expert(Protocol):
 
 class WorldKind:
     """Environments and experts of one origin, made from the names of robot and task."""
+
+    def tasks_in(self, task: NameOrPath) -> tuple[NameOrPath, ...]:
+        """Return the tasks that a text names, `lift,stack`; each of them once."""
+        return checks.tasks_in(task) if isinstance(task, str) else (task,)
 
     def complete(self, config: EnvConfig) -> EnvConfig:
         """Return settings with 0 and empty values filled in. Raises `UsageError`, `UnknownName`."""

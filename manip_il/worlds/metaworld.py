@@ -7,6 +7,7 @@ learning". What is trained here is measured by `lerobot-eval --env.type=metaworl
 
 from __future__ import annotations
 
+import pickle
 import warnings
 from collections.abc import Mapping
 from functools import cache
@@ -29,7 +30,6 @@ from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 from manip_il.worlds.metaworld_experts import EXPERTS
 
 INSTALL = "pip install --no-deps metaworld==3.0.0"
-SEED = 42  # of the task that LeRobot's environment takes
 CAMERA, CAMERA_AT = "corner2", (0.75, 0.075, 0.7)  # LeRobot's place of it [m]
 ROBOT = 4  # numbers of the observation that are the robot's: hand (3,) [m], and gripper
 
@@ -60,11 +60,12 @@ class Metaworld(GymWorld):
     @override
     def make(self) -> Any:
         metaworld, scripts = _package()
-        only = metaworld.MT1(self.task, seed=SEED)
-        env = only.train_classes[self.task](render_mode="rgb_array", camera_name=CAMERA)
-        env.set_task(only.train_tasks[0])
+        cls = metaworld.ALL_V3_ENVIRONMENTS[self.task]
+        env = cls(render_mode="rgb_array", camera_name=CAMERA)
+        # As a task of `MT1`, which takes seconds to draw 50 starts. None of these is needed.
+        settings = {"env_cls": cls, "partially_observable": False, "rand_vec": None}
+        env.set_task(metaworld.Task(self.task, pickle.dumps(settings)))
         env.model.camera(CAMERA).pos[:] = CAMERA_AT
-        env.reset()
         env._freeze_rand_vec = False
         env.seeded_rand_vec = True
         script = _known()["TASK_POLICY_MAPPING"][self.task]
@@ -103,6 +104,7 @@ class Metaworld(GymWorld):
 
 
 Metaworld.tasks = tuple(_known()["TASK_POLICY_MAPPING"])
+Metaworld.groups = {name: tuple(tasks) for name, tasks in _known()["DIFFICULTY_TO_TASKS"].items()}
 
 
 def _package() -> tuple[Any, Any]:

@@ -38,8 +38,25 @@ _OURS = "manip_il.worlds.ladder.world"  # of every other robot
 
 
 @cache
-def world_of(robot: NameOrPath) -> WorldKind:
-    """Return the world of a robot, of a `Path` of a world of one's own, or of an entry point."""
+def world_of(robot: NameOrPath, task: NameOrPath = "") -> WorldKind:
+    """Return the world of a robot, of a `Path` of a world of one's own, or of an entry point.
+
+    Args:
+        robot: Its name or path.
+        task: Its task, or several, which then are one world.
+    """
+    kind = _kind_of(robot)
+    if len(names := kind.tasks_in(task)) > 1:
+        return import_module("manip_il.worlds.several").SeveralTasks(kind, names)
+    return kind
+
+
+def task_names(config: EnvConfig) -> tuple[NameOrPath, ...]:
+    """Return the tasks that the episodes of an environment have, in turn by seed."""
+    return world_of(config.robot).tasks_in(config.task)
+
+
+def _kind_of(robot: NameOrPath) -> WorldKind:
     is_file = isinstance(robot, Path) and robot.suffix == ".py"
     if is_file or entry_points(group=WORLD_GROUP, name=str(robot)):
         return import_module("manip_il.worlds.gym.environment").own_kind(robot)
@@ -104,7 +121,9 @@ def stored_config(
             raises.
     """
     given = {"robot": robot, "task": task, "object": shape}
-    needed = world_of(spec.robot).own_files(spec, "")  # what a mesh needs is told better below
+    needed = world_of(spec.robot, spec.task).own_files(
+        spec, ""
+    )  # what a mesh needs is told better below
     if lacking := [one for one in needed if not given[FIELDS[one.partition("=")[0]]]]:
         raise UsageError(
             f"{spec.robot} {spec.task} was made with a file of your own; give {' '.join(lacking)}"
@@ -123,7 +142,7 @@ def complete(config: EnvConfig) -> EnvConfig:
     Raises what `make_config` raises.
     """
     check_bounds(config)
-    config = world_of(config.robot).complete(config)
+    config = world_of(config.robot, config.task).complete(config)
     if config.horizon < config.success_steps:
         raise UsageError(
             f"horizon is {config.horizon}, success_steps {config.success_steps}; expected horizon"
@@ -149,19 +168,19 @@ def make_env(
     spec = env_spec(config, cameras)
     if changed := [one.name for one in conditions if one.ranges]:
         spec.require("varied", f"leave out {', '.join(changed)}")
-    return world_of(config.robot).environment(config, cameras, conditions)
+    return world_of(config.robot, config.task).environment(config, cameras, conditions)
 
 
 @cached_per_thread(_KEPT)
 def described_env(config: EnvConfig) -> Environment:
     """Return an environment, cached for this thread, to read from; no episode runs in it."""
-    return world_of(config.robot).environment(config, None, ())
+    return world_of(config.robot, config.task).environment(config, None, ())
 
 
 @cached_per_thread(_KEPT)
 def make_expert(config: EnvConfig) -> Expert:
     """Return the expert of an environment, cached for this thread."""
-    return world_of(config.robot).expert(config)
+    return world_of(config.robot, config.task).expert(config)
 
 
 @cache
@@ -184,11 +203,11 @@ def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> d
     look = (
         {}
         if cameras is None
-        else {"cameras_sha256": world_of(config.robot).look_sha256(config, cameras)}
+        else {"cameras_sha256": world_of(config.robot, config.task).look_sha256(config, cameras)}
     )
     return _fingerprint(config) | look
 
 
 @cache
 def _fingerprint(config: EnvConfig) -> dict[str, str]:
-    return world_of(config.robot).fingerprint(config)
+    return world_of(config.robot, config.task).fingerprint(config)

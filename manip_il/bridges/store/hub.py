@@ -375,7 +375,7 @@ def policy_facts(root: Path) -> dict[str, Any]:
         path = root / inside / f"{name}.json"
         facts[name] = checks.read_json(path, "JSON") if path.is_file() else {}
     robot, task = (facts["manip_il"].get(name) or "" for name in ("robot", "task"))
-    facts["lerobot_words"] = world_of(robot).lerobot_words(robot, task)
+    facts["lerobot_words"] = world_of(robot, task).lerobot_words(robot, task)
     own = policy_sha256(root / inside)
     evaluations = [  # of this policy, undisturbed, and not on the seeds that chose it
         result

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import F64, Label, Observation, State
+from manip_il.option import NameOrPath
 from manip_il.own_file import own_class, source_hash
 from manip_il.robots.action_space import ActionSpace
 from manip_il.robots.spec import model_bytes
@@ -292,6 +293,13 @@ class GymKind(WorldKind):
                 )
         horizon = config.horizon or own["horizon"]
         return replace(config, task=task or _name(world), horizon=horizon, **fixed)
+
+    @override
+    def tasks_in(self, task: NameOrPath) -> tuple[NameOrPath, ...]:
+        """Return the tasks that a text names, also by groups of the world's; each of them once."""
+        groups = self._cls.groups
+        named = super().tasks_in(task)
+        return tuple(dict.fromkeys(one for name in named for one in groups.get(str(name), (name,))))
 
     def _task(self, config: EnvConfig) -> str:
         """Return the chosen task; "" if the world has only one."""

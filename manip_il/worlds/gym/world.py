@@ -25,6 +25,7 @@ class GymWorld:
     Attributes:
         name: Its name in datasets; by default the class's, in lower case.
         tasks: Names of its tasks, if there are several; `task` is the chosen one.
+        groups: Names for several of its tasks together.
         instruction: The task in words.
         fps: Control steps per second; by default the environment's `render_fps`.
         horizon: Most control steps of an episode; by default the environment's own limit.
@@ -39,6 +40,7 @@ class GymWorld:
 
     name: str = ""
     tasks: tuple[str, ...] = ()
+    groups: Mapping[str, tuple[str, ...]] = {}  # read alone
     instruction: str = ""
     fps: int = 0
     horizon: int = 0

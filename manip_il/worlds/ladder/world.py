@@ -117,7 +117,7 @@ def make_env(
     """
     config = make_config(robot, task, **settings)
     seen = CameraConfig(tuple(cameras), *image_size, look or Look()) if cameras else None
-    if world_of(config.robot) is not WORLD:
+    if world_of(config.robot, config.task) is not WORLD:
         return any_env(config, seen, conditions)
     return ManipEnv(
         *parts_of(config),
