@@ -7,8 +7,8 @@ a function that maps the turns of a step to an action (n,) and an actor for each
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, override
@@ -98,6 +98,36 @@ class NoisyExpertDriver(Driver):
         def act(turn: Turn) -> tuple[F64, Actor]:
             noise = rngs(turn.seed).multivariate_normal(np.zeros(len(covariance)), covariance)
             return turn.query().action + noise, Actor.NOISY_EXPERT
+
+        return lambda turns: list(map(act, turns))
+
+
+@dataclass(frozen=True)
+class DisturbedDriver(Driver):
+    """Executes the expert's label, except where a random action replaces it.
+
+    Attributes:
+        share: Share of the control steps at which that happens.
+        moments: A control step from which it happens, too, by seed.
+        steps: Number of control steps for which it then happens.
+    """
+
+    share: float = 0.0
+    moments: Mapping[int, int] = field(default_factory=dict[int, int])
+    steps: int = 1
+    kind = "disturbed"
+    beta = 1.0
+
+    @override
+    def start(self, setting: Setting) -> Act:
+        draw = setting.actions.random_near
+
+        def act(turn: Turn) -> tuple[F64, Actor]:
+            rng = rng_for(turn.seed, "disturbed", turn.step)
+            since = turn.step - self.moments.get(turn.seed, turn.step + 1)
+            if rng.uniform() < self.share or 0 <= since < self.steps:
+                return draw(turn.observation.state, rng), Actor.NOISY_EXPERT
+            return turn.query().action, Actor.EXPERT
 
         return lambda turns: list(map(act, turns))
 

@@ -14,10 +14,12 @@ this mu-recoverability. The largest gap among sampled actions, as here, is a low
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from manip_il.collect.drivers import DisturbedDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
@@ -34,6 +36,9 @@ from manip_il.worlds.table import env_fingerprint, env_spec
 
 FILE_NAME = "certificate.json"
 NOISE = 0.1  # standard deviation of the actions' noise, as a share of their range
+SHARE = 0.3  # share of random actions, where a world has no noise
+# other worlds than ours: kind -> number of random actions in a row
+_RANDOM = {"random": 1, "lost": 20}
 Group = Literal["start", "state", "action"]
 
 
@@ -155,12 +160,53 @@ class Certificate:
 
 
 def count_episodes(env: EnvConfig, cases: int) -> int:
-    """Return the largest number of episodes that `certify` runs.
+    """Return the largest number of episodes that `certify` runs."""
+    return cases * (2 + len(_kinds(env)))
 
-    Raises `Unable` if its states cannot be perturbed.
+
+class _Kind(NamedTuple):
+    """A kind of perturbation: what it perturbs, its name, and its job for moments by seed."""
+
+    group: Group
+    words: str
+    job: Callable[[EnvConfig, Mapping[int, int]], RolloutJob]
+
+
+def _kinds(env: EnvConfig) -> dict[str, _Kind]:
+    """Return the kinds of perturbation of an environment: those of `manip_il.sim.events`, or, in
+    other worlds, random actions.
     """
-    env_spec(env).require("perturbed", "choose another robot")
-    return cases * (2 + len(kinds_for(get_task(env.task))))
+    if "perturbed" not in env_spec(env).can:
+        return {
+            kind: _Kind(
+                "action" if steps == 1 else "state",
+                "random action" if steps == 1 else f"{steps} random actions",
+                partial(_lost, steps),
+            )
+            for kind, steps in _RANDOM.items()
+        }
+    return {
+        kind: _Kind("action" if known.wrong else "state", known.words, partial(_perturbed, kind))
+        for kind, known in kinds_for(get_task(env.task)).items()
+    }
+
+
+def _lost(steps: int, env: EnvConfig, moments: Mapping[int, int]) -> RolloutJob:
+    return RolloutJob(env, DisturbedDriver(moments=moments, steps=steps), hold=0)
+
+
+def _perturbed(kind: str, env: EnvConfig, moments: Mapping[int, int]) -> RolloutJob:
+    return RolloutJob(env, hold=0, conditions=(Perturbation(kind, moments),))
+
+
+def _noisy(env: EnvConfig) -> tuple[str, RolloutJob]:
+    """Return the job of the expert with noise, and the noise in words."""
+    if "varied" in env_spec(env).can:
+        noise = Condition("noise", action_noise=(NOISE, NOISE))
+        job = RolloutJob(env, hold=0, conditions=(noise,))
+        return f"{100 * NOISE:.0f} % noise on every action", job
+    job = RolloutJob(env, DisturbedDriver(SHARE), hold=0)
+    return f"{100 * SHARE:.0f} % of the actions random", job
 
 
 def certify(
@@ -210,19 +256,19 @@ def certify(
             f"the expert solved none of {len(seeds)} undisturbed episodes within {env.horizon}"
             " steps, so there is nothing to perturb; give it a longer --env.horizon"
         )
-    for kind, known in kinds_for(get_task(env.task)).items():
+    for kind, known in _kinds(env).items():
         moments = {seed: draw_moment(seed, kind, steps) for seed, steps in solved.items()}
         longer = replace(env, horizon=max(moments.values()) + env.horizon)
-        job = RolloutJob(longer, hold=0, conditions=(Perturbation(kind, moments),))
+        job = known.job(longer, moments)
         found = [
             _case(episode, moment, env.horizon, solved[episode.seed] - moment)
             for episode in rollouts(job, list(moments))
             if _differ(episode, plain[episode.seed], moment := moments[episode.seed])
         ]
-        add("action" if known.wrong else "state", kind, known.words, found)
-    job = RolloutJob(env, hold=0, conditions=(Condition("noise", action_noise=(NOISE, NOISE)),))
+        add(known.group, kind, known.words, found)
+    words, job = _noisy(env)
     noisy = (_case(episode, 0, env.horizon) for episode in rollouts(job))
-    add("start", "noise", f"{100 * NOISE:.0f} % noise on every action", noisy)
+    add("start", "noise", words, noisy)
     names = ("horizon", "control_hz", "tolerance", "success_steps")
     settings = {"cases": cases, "seed": seed} | {name: getattr(env, name) for name in names}
     spec = env_spec(env)

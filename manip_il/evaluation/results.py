@@ -293,6 +293,7 @@ class EvalResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the contents of `eval.json`."""
+        tasks = {name: part.success.to_json() for name, part in self.by_task.items()}
         method = "Wilson's score interval"
         if self.until_width is not None:
             method = "confidence sequence: holds whenever one stops"
@@ -307,7 +308,7 @@ class EvalResult:
             "by_condition": {
                 name: part.success.to_json() for name, part in self.by_condition.items() if name
             },
-            "by_task": {name: part.success.to_json() for name, part in self.by_task.items()},
+            **({"by_task": tasks} if tasks else {}),
             "policy": self.policy,
             "policy_sha256": self.policy_sha256,
             "robot": self.robot,

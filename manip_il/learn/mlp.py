@@ -127,7 +127,8 @@ class MLPPolicy(PreTrainedPolicy):
             key for key in (STATE, ENVIRONMENT_STATE) if key in (config.input_features or {})
         ]
         if config.reads_text is None:
-            config.reads_text = dataset_meta is not None and len(dataset_meta.tasks) > 1
+            tasks = getattr(dataset_meta, "tasks", None)
+            config.reads_text = tasks is not None and len(tasks) > 1
         if config.scales and not config.scaled and dataset_meta is not None:
             reads = ENVIRONMENT_STATE in self.inputs or getattr(config, "aux_weight", 0) > 0
             config.scaled = self._offsets(offsets_of(dataset_meta.features if reads else {}))

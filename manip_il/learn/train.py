@@ -7,6 +7,7 @@ step.
 Train a policy on datasets: behaviour cloning.
 """
 
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -60,6 +61,7 @@ from manip_il.option import make_options
 from manip_il.progress import Progress
 from manip_il.seeding import stream_base
 
+_LOG = logging.getLogger(__name__)
 # metrics that LeRobot's `update_policy` sets
 _METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
@@ -121,6 +123,10 @@ class Trainer:
         in_processors = is_in_processors(self.pipeline.policy.type, self.conversion)
         self.encoder = self.conversion if in_processors else None  # else the network converts
         self.meta: Any = JoinedDatasets(datasets)
+        if not language and len(self.meta.tasks) > 1:
+            _LOG.warning(
+                "%s reads no text, and the data have %d tasks", config.kind, len(self.meta.tasks)
+            )
         self.data = self.read_data(columns, on_frames)
         self.order = self.draw_order(shares, weights)
         self._augment = Augment() if config.augments else None

@@ -18,7 +18,7 @@ class Listed(NamedTuple):
     about: str
     tasks: tuple[str, ...]  # some of them, if there are `others`
     cameras: tuple[str, ...] = ()
-    others: int = 0
+    others: str = ""
 
 
 WORLD_GROUP = "manip_il.worlds"  # entry points: a world's name, and its `GymWorld`
@@ -39,14 +39,13 @@ WORLDS: dict[NameOrPath, Listed] = {
         "Meta-World's Sawyer",
         ("push-v3", "peg-insert-side-v3"),
         ("corner2",),
-        others=48,
+        others="48 others, easy, medium, hard, very_hard",
     ),
 }
 
 
 def _listed(world: Listed) -> str:
-    others = (f"{world.others} others",) if world.others else ()
-    return ", ".join(world.tasks + others)
+    return ", ".join((*world.tasks, *([world.others] if world.others else [])))
 
 
 ROBOT_HELP = (
@@ -55,7 +54,8 @@ ROBOT_HELP = (
     f"{', '.join(f'{name} ({world.about})' for name, world in WORLDS.items())}"
 )
 TASK_HELP = (
-    f"{', '.join((*NAMES, *SEVERAL))}, or the path of your own task's Python file; "
+    f"{', '.join((*NAMES, *SEVERAL))}, several of these with commas between them, or the path of"
+    " your own task's Python file; "
     f"{'; '.join(f'with {name}, ' + _listed(world) for name, world in WORLDS.items())}"
 )
 

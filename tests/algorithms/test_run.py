@@ -18,11 +18,13 @@ from manip_il.collect.workers import Engine
 from manip_il.data.atomic import read_lines
 from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.evaluation.results import EvalResult
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Actor, Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
-from manip_il.worlds.table import make_config
+from manip_il.worlds.several import divide
+from manip_il.worlds.table import env_spec, make_config
 
 from ..conftest import watching
 from ..damage import check_same_data, digests
@@ -293,3 +295,18 @@ def test_a_blind_learner_is_taught_by_an_expert_that_sees_everything(tmp_path):
     assert merged.episodes == sum(
         Dataset.open(root).info.episodes for root in datasets(tmp_path, 1)
     )
+
+
+def test_several_tasks_are_one_run_whose_rollouts_are_where_its_policy_fails(tmp_path):
+    env = make_config("fetch", "reach,lift", horizon=40)
+    config = replace(CONFIG, env=env, episodes_per_round=8, validation_episodes=4)
+    results = list(Run(config, tmp_path, Engine()).results())
+    first, second = (Dataset.open(path) for path in datasets(tmp_path, 1))
+    assert sorted(first.tasks) == [0, 1]
+    texts = [env_spec(make_config("fetch", task)).instruction for task in ("reach", "lift")]
+    assert [first.episodes.tasks.count([text]) for text in texts] == [2, 2]
+    parts = results[0].validation.by_task
+    failed = [2 - parts[task].success.successes for task in ("reach", "lift")]
+    wanted = divide(8, [(count + 1) / 4 for count in failed])
+    assert [second.episodes.tasks.count([text]) for text in texts] == wanted
+    assert Checkpoint.open(results[1].policy).config["reads_text"]

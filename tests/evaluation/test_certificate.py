@@ -67,6 +67,22 @@ def test_the_file_holds_every_case_and_what_follows_from_them():
     )
 
 
+def test_in_other_worlds_the_expert_is_lost_by_random_actions():
+    env = make_config("fetch_stock", "FetchReach-v4")
+    episodes = []
+    made = certify(Engine(), env, 4, on_episode=episodes.append)
+    assert len(episodes) == count_episodes(env, 4) == 16
+    kinds = ["start", "random", "lost", "noise"]
+    assert [(one.kind, one.success.rate, one.left_out) for one in made.rows] == [
+        (kind, 1.0, 0) for kind in kinds
+    ]
+    assert made.mu is not None
+    for case in made.rows[2].cases:
+        rows = next(one for one in episodes[8:12] if one.seed == case.seed)
+        wrong = (rows.columns["action"] != rows.columns["executed_action"]).any(1)
+        assert np.flatnonzero(wrong)[0] == case.moment
+
+
 @pytest.mark.parametrize("kind", ["random", "opposite"])
 def test_costs_are_those_of_stepping_the_simulator_by_hand(measured: Certificate, kind: str):
     expert = Expert(scene_of("fetch", "pick_place"))

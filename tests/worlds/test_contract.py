@@ -7,15 +7,22 @@ import dataclasses
 import numpy as np
 import pytest
 
+from manip_il.checks import tasks_in
 from manip_il.errors import UsageError
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.world import EnvironmentSpec
 from manip_il.worlds.config import WORLDS
-from manip_il.worlds.table import env_spec, make_config, make_env, make_expert
+from manip_il.worlds.several import PRESENT, divide, task_number
+from manip_il.worlds.table import env_spec, make_config, make_env, make_expert, task_names
 
-KINDS = [("panda", "sort"), *((str(robot), world.tasks[-1]) for robot, world in WORLDS.items())]
+SEVERAL = ("panda", "lift,stack,reach")
+KINDS = [
+    ("panda", "sort"),
+    SEVERAL,
+    *((str(robot), world.tasks[-1]) for robot, world in WORLDS.items()),
+]
 every_kind = pytest.mark.parametrize(("robot", "task"), KINDS)
 
 
@@ -64,6 +71,49 @@ def test_what_it_cannot_do_is_one_line(robot: str, task: str):
     if not spec.all_cameras:
         with pytest.raises(UsageError, match=f"^{robot} cannot be drawn; omit --cameras=front$"):
             env_spec(config, CameraConfig(("front",)))
+
+
+def test_of_several_tasks_an_episode_has_one_and_is_the_same_as_alone():
+    config = make_config(*SEVERAL)
+    env, names = make_env(config), task_names(config)
+    seeds = stream_seeds("training", 6)
+    texts = set()
+    for seed in seeds:
+        number = task_number(seed, len(names))
+        alone = make_config("panda", str(names[number]), horizon=config.horizon)
+        other = make_env(alone)
+        env.start(seed)
+        other.start(seed)
+        seen, theirs = env.observe(), other.observe()
+        found = dict(zip(env.spec.environment_state_names, seen.environment_state, strict=True))
+        own = dict(zip(other.spec.environment_state_names, theirs.environment_state, strict=True))
+        lacking = found.keys() - own.keys()
+        assert own.items() <= found.items()
+        assert not any(found[name] for name in lacking if not name.startswith(PRESENT))
+        for name in (one for one in found if one.startswith(PRESENT)):
+            assert found[name] == (name.removeprefix(PRESENT) in own)
+        label = make_expert(config).label(env.get_state(), env)
+        theirs_label = make_expert(alone).label(other.get_state())
+        assert np.array_equal(label.action, theirs_label.action)
+        assert env.spec.phases[label.phase] == other.spec.phases[theirs_label.phase]
+        assert env.step(label.action)[1:] == other.step(label.action)[1:]
+        texts.add(seen.instruction)
+    assert len(texts) == len(names)
+
+
+def test_tasks_and_conditions_that_take_turns_meet_each_other():
+    met = {(task_number(seed, 4), seed % 2) for seed in range(1000, 1032)}
+    assert met == {(task, condition) for task in range(4) for condition in range(2)}
+
+
+def test_episodes_are_divided_in_proportion():
+    assert divide(10, [1, 1, 1]) == [4, 3, 3]
+    assert divide(9, [0.5, 1, 3]) == [1, 2, 6]
+
+
+def test_numbers_of_a_task_have_commas_too():
+    assert tasks_in("lift,carry:dirt=1,far=0.5,lift") == ("lift", "carry:dirt=1,far=0.5")
+    assert len(task_names(make_config("metaworld", "easy,peg-insert-side-v3"))) == 29
 
 
 def test_what_only_an_environment_has_is_neither_stored_nor_compared():
