@@ -15,6 +15,7 @@ from manip_il.worlds.aloha.ladder import (
     PITCH,
     AlohaScene,
     AlohaTask,
+    HandRung,
     HandTarget,
     Held,
     Thing,
@@ -24,7 +25,6 @@ from manip_il.worlds.aloha.ladder import (
     pitched,
     take_rungs,
 )
-from manip_il.worlds.packaged import PackagedRung
 
 PEG, SOCKET = "peg", "socket"
 OF = {"left": SOCKET, "right": PEG}
@@ -90,12 +90,12 @@ def _lifted_to(thing: Thing, to: F64) -> F64:
     return np.array([thing.position[0] + way[0], thing.position[1] + way[1], to[2]])
 
 
-def _carry(side: str, to: F64) -> PackagedRung:
+def _carry(side: str, to: F64) -> HandRung:
     def target(scene: Insertion) -> HandTarget:
         place = _lifted_to(scene.things[OF[side]], to)
         return move_object(scene, side, OF[side], place, np.eye(3), CARRIED)
 
-    return PackagedRung("carry", lambda scene: scene.has[side], target)
+    return HandRung("carry", lambda scene: scene.has[side], target)
 
 
 def _insert(scene: Insertion) -> HandTarget:
@@ -109,10 +109,10 @@ def _insert(scene: Insertion) -> HandTarget:
 _RUNGS = {
     "left": (_carry("left", MEETING), *take_rungs("left", SOCKET, lambda one: one.grasps["left"])),
     "right": (
-        PackagedRung(
+        HandRung(
             "insert", lambda one: one.has["right"] and one.ready and one.depth < BEFORE, _insert
         ),
-        PackagedRung("align", lambda one: one.has["right"] and one.ready, _insert),
+        HandRung("align", lambda one: one.has["right"] and one.ready, _insert),
         _carry("right", MEETING + WAITING),
         *take_rungs("right", PEG, lambda one: one.grasps["right"]),
     ),

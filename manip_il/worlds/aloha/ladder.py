@@ -13,7 +13,6 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.geometry import angle_between, turned_towards
-from manip_il.worlds.packaged import PackagedRung, always
 
 SIDES = ("left", "right")
 FINGER_AT_TOUCH = 0.0224  # position of a finger joint at which the fingers would touch [m]
@@ -106,6 +105,25 @@ class Thing:
         return np.stack([ahead, cross(up, ahead), up], axis=1)
 
 
+class HandRung(NamedTuple):
+    """A phase of one hand.
+
+    Attributes:
+        name: Name of the phase.
+        holds: Returns whether the rung holds in a scene.
+        target: Returns the hand's `HandTarget` in a scene.
+    """
+
+    name: str
+    holds: Callable[[Any], bool]
+    target: Callable[[Any], HandTarget]
+
+
+def always(scene: AlohaScene) -> bool:
+    """Return True: the rung holds in every state."""
+    return True
+
+
 @dataclass(frozen=True)
 class AlohaTask:
     """One task of `gym_aloha`.
@@ -127,10 +145,10 @@ class AlohaTask:
     objects: Mapping[str, Held]
     grasped: Mapping[str, str]
     scene: type[AlohaScene]
-    rungs: Mapping[str, tuple[PackagedRung, ...]]
+    rungs: Mapping[str, tuple[HandRung, ...]]
     inserted: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def phases(self) -> tuple[str, ...]:
         """`none`, then `LEFT, RIGHT` for every pair of the two hands' rungs, earliest first."""
         left, right = (self.rungs[side][::-1] for side in SIDES)
@@ -336,9 +354,7 @@ def approach(
     return HandTarget(hand.position + way, rotation, OPEN, longest)
 
 
-def take_rungs(
-    side: str, name: str, grasp: Callable[[Any], F64]
-) -> tuple[PackagedRung, PackagedRung]:
+def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[HandRung, HandRung]:
     """Return the rungs of a hand that takes an object from the table, the latest first.
 
     Args:
@@ -347,12 +363,12 @@ def take_rungs(
         grasp: Returns the rotation of the grasp in a scene, (3, 3).
     """
     return (
-        PackagedRung(
+        HandRung(
             "grasp",
             lambda one: one.is_at_grasp(side, name, grasp(one)),
             lambda one: close_on(one, name, grasp(one)),
         ),
-        PackagedRung("approach", always, lambda one: approach(one, side, name, grasp(one))),
+        HandRung("approach", always, lambda one: approach(one, side, name, grasp(one))),
     )
 
 

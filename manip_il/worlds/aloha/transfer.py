@@ -13,18 +13,19 @@ from manip_il.worlds.aloha.ladder import (
     PITCH,
     AlohaScene,
     AlohaTask,
+    HandRung,
     HandTarget,
     Held,
     X,
     Z,
     ahead_across,
+    always,
     approach,
     close_on,
     nearest,
     pitched,
     take_rungs,
 )
-from manip_il.worlds.packaged import PackagedRung, always
 
 CUBE = "box"
 MEETING = np.array([0.0, 0.5, 0.25])  # position of the cube for the handover [m]
@@ -118,24 +119,22 @@ def _wait(scene: Transfer) -> HandTarget:
 
 _RUNGS = {
     "left": (
-        PackagedRung(
+        HandRung(
             "hold",
             lambda one: one.left_holds,
             lambda one: HandTarget(one.left.position, one.left.rotation, CLOSED),
         ),
-        PackagedRung(
+        HandRung(
             "close",
             lambda one: one.lifted and one.is_at_grasp("left", CUBE, one.left_grasp),
             lambda one: close_on(one, CUBE, one.left_grasp, CARRIED),
         ),
-        PackagedRung(
-            "come", lambda one: one.right_holds and one.lifted and one.to_go < NEAR, _come
-        ),
-        PackagedRung("wait", always, _wait),
+        HandRung("come", lambda one: one.right_holds and one.lifted and one.to_go < NEAR, _come),
+        HandRung("wait", always, _wait),
     ),
     "right": (
-        PackagedRung("release", lambda one: one.left_holds and one.left.gap < LEFT_CLOSED, _let_go),
-        PackagedRung("carry", lambda one: one.right_holds, _carry),
+        HandRung("release", lambda one: one.left_holds and one.left.gap < LEFT_CLOSED, _let_go),
+        HandRung("carry", lambda one: one.right_holds, _carry),
         *take_rungs("right", CUBE, lambda one: one.right_grasp),
     ),
 }
