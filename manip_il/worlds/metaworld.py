@@ -8,7 +8,6 @@ learning". What is trained here is measured by `lerobot-eval --env.type=metaworl
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -52,11 +51,6 @@ class Metaworld(GymWorld):
     horizon = 500
     cameras = (CAMERA,)
 
-    def __init__(self, task: str = ""):
-        super().__init__(task)
-        self.instruction = _known()["TASK_DESCRIPTIONS"].get(task, "")
-        self._script: Any = None
-
     @override
     def make(self) -> Any:
         metaworld, scripts = _package()
@@ -67,8 +61,8 @@ class Metaworld(GymWorld):
         env.reset()
         env._freeze_rand_vec = False
         env.seeded_rand_vec = True
-        script = _known()["TASK_POLICY_MAPPING"][self.task]
-        self._script = getattr(scripts, script)()
+        self.instruction = _known()["TASK_DESCRIPTIONS"][self.task]
+        self._script = getattr(scripts, _known()["TASK_POLICY_MAPPING"][self.task])()
         return env
 
     @override
@@ -79,10 +73,6 @@ class Metaworld(GymWorld):
     @override
     def observe(self, env: Any, seen: F64) -> dict[str, F64]:
         return {AGENT: seen[:ROBOT], AROUND: seen[ROBOT:]}
-
-    @override
-    def solved(self, env: Any, info: Mapping[str, Any]) -> bool:
-        return bool(info.get("success", False))
 
     @override
     def act(self, env: Any, seen: F64) -> F64:

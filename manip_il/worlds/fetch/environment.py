@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from manip_il.mdp import F64, Label, State
 from manip_il.worlds.contract import EnvironmentSpec
-from manip_il.worlds.fetch.expert import LADDERS, REACH, FetchScene
+from manip_il.worlds.fetch.expert import LADDERS, REACH, scene_of
 from manip_il.worlds.gym.environment import GymActions, GymEnv, GymKind, coordinates
 from manip_il.worlds.gym.restoring import WHOLE, physics_of
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
@@ -40,10 +40,6 @@ class Fetch(GymWorld):
     phases = ("none", "approach", "grasp", "carry", "push", "hold")
     cameras = ()
 
-    def __init__(self, task: str = ""):
-        super().__init__(task)
-        self.instruction = INSTRUCTIONS[task]
-
     @override
     def make(self) -> Any:
         # gymnasium-robotics announces its versions there
@@ -53,6 +49,7 @@ class Fetch(GymWorld):
             env: Any = gymnasium.make(self.task, reward_type="sparse").unwrapped
         env._mujoco_step = partial(self._run_physics, env)
         env.action_space = gymnasium.spaces.Box(-1, 1, (len(NAMES),), np.float64)
+        self.instruction = INSTRUCTIONS[self.task]
         self.names = {AGENT: NAMES, AROUND: _observed_names(env.has_object), "action": NAMES}
         return TransformObservation(env, lambda _: env.goal, None)
 
@@ -69,13 +66,13 @@ class Fetch(GymWorld):
         """
         own = env.unwrapped._get_obs()["observation"]
         return {
-            AGENT: np.append(own[:3], FetchScene(env).opening),
+            AGENT: np.append(own[:3], scene_of(env).opening),
             AROUND: np.append(own, env.unwrapped.goal),
         }
 
     @override
     def act(self, env: Any, seen: F64) -> Label:
-        phase, way, fingers = LADDERS[self.task](FetchScene(env))
+        phase, way, fingers = LADDERS[self.task](scene_of(env))
         action = np.append(np.clip(way / REACH, -1, 1), fingers)
         return Label(action, self.phases.index(phase), True, 0.0)
 
@@ -84,13 +81,13 @@ class Fetch(GymWorld):
         """Return the share of the task that is done: 1 within the tolerance, 0.5 at twice that
         distance.
         """
-        *_, moved = self.positions(env).values()
-        left = np.linalg.norm(moved - env.unwrapped.goal)
+        scene = scene_of(env)
+        left = np.linalg.norm(scene.object - scene.goal)
         return TOLERANCE / max(TOLERANCE, float(left))
 
     @override
     def positions(self, env: Any) -> dict[str, F64]:
-        scene = FetchScene(env)
+        scene = scene_of(env)
         things = {"object": scene.object} if env.unwrapped.has_object else {}
         return {"hand": scene.gripper} | things
 
@@ -158,13 +155,12 @@ def _motion(data: mujoco.MjData) -> F64:
 
 def _observed_names(has_object: bool) -> tuple[str, ...]:
     """Return the names of the entries of `environment_state`, (k,)."""
-    things = ("object", "object_offset") if has_object else ()
-    turning = ("object_turn", "object_velocity", "object_spin") if has_object else ()
     fingers = ("finger.right", "finger.left")
-    return (
-        *coordinates("ee", *things),
+    names = (
+        *coordinates("ee", "object", "object_offset"),
         *fingers,
-        *coordinates(*turning, "ee_velocity"),
+        *coordinates("object_turn", "object_velocity", "object_spin", "ee_velocity"),
         *(f"{name}.velocity" for name in fingers),
         *coordinates("goal"),
     )
+    return tuple(name for name in names if has_object or not name.startswith("object"))

@@ -7,7 +7,7 @@ longest of x, y and z determines how long a move takes.
 """
 
 import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,43 +53,37 @@ DOWN = 0.5  # share of a step after which a gripper that descends past the cube 
 LEG = 0.005  # cost of every leg of a path around the cube, added to its length [m]
 
 
-class FetchScene:
-    """Gripper, cube and goal in the present state of an environment.
+class FetchScene(NamedTuple):
+    """What the ladders read from a state.
 
-    Args:
-        env: The environment; all tasks but `FetchReach-v4` have a cube.
+    Attributes:
+        gripper: Position between the fingers, (3,) [m].
+        opening: Distance between the fingers [m].
+        object: Position of the cube, or of the gripper if there is no cube, (3,) [m].
+        object_velocity: Its velocity, (3,) [m/s].
+        goal: Desired goal, (3,) [m].
     """
 
-    def __init__(self, env: Any):
-        self._env = env.unwrapped
+    gripper: F64
+    opening: float
+    object: F64
+    object_velocity: F64
+    goal: F64
 
-    @property
-    def gripper(self) -> F64:
-        """Position between the fingers, (3,) [m]."""
-        return self._env.data.site("robot0:grip").xpos
 
-    @property
-    def object(self) -> F64:
-        """Position of the cube, (3,) [m]."""
-        return self._env.data.site("object0").xpos
-
-    @property
-    def object_velocity(self) -> F64:
-        """Velocity of the cube, (3,) [m/s]."""
-        return self._env._utils.get_site_xvelp(self._env.model, self._env.data, "object0")
-
-    @property
-    def opening(self) -> float:
-        """Distance between the fingers [m]."""
-        return sum(
-            float(self._env.data.joint(f"robot0:{side}_gripper_finger_joint").qpos[0])
-            for side in "rl"
-        )
-
-    @property
-    def goal(self) -> F64:
-        """Desired goal, (3,) [m]."""
-        return self._env.goal
+def scene_of(env: Any) -> FetchScene:
+    """Return what the ladders read from the present state of an environment."""
+    inner = env.unwrapped
+    model, data = inner.model, inner.data
+    fingers = (data.joint(f"robot0:{side}_gripper_finger_joint").qpos[0] for side in "rl")
+    moved = "object0" if inner.has_object else "robot0:grip"
+    return FetchScene(
+        data.site("robot0:grip").xpos,
+        float(sum(fingers)),
+        data.site(moved).xpos,
+        inner._utils.get_site_xvelp(model, data, moved),
+        inner.goal,
+    )
 
 
 def _to_cube(scene: FetchScene) -> F64:

@@ -98,7 +98,7 @@ class GymEnv(Environment):
     @override
     def progress(self) -> float:
         if not self._spec.has_progress:
-            return float(self._solved)
+            return float(self._streak > 0)
         return float(self.world.progress(self.env, self._info))
 
     @override
@@ -108,8 +108,7 @@ class GymEnv(Environment):
         self._seen, self._info = self.world.reset(self.env, seed % self.most_seed)
         if self._simulated:  # poses that belong to the state, as after it is restored
             self._simulated.forward()
-        self._count(0, 0, False)
-        self._solved, self._label = False, None
+        self._count_from(State(np.empty(0), np.empty(0)))
 
     @override
     def observe(self) -> Observation:
@@ -130,11 +129,12 @@ class GymEnv(Environment):
         self._seen, reward, terminated, truncated, self._info = self.env.step(
             given.astype(self.env.action_space.dtype)
         )
-        self._solved, self._label = bool(self.world.solved(self.env, self._info)), None
-        self._count(
-            self._step + 1, self._streak + 1 if self._solved else 0, self._ever or self._solved
-        )
-        return Outcome(action, float(reward), self._solved, bool(terminated or truncated))
+        self._label = None
+        solved = bool(self.world.solved(self.env, self._info))
+        self._step += 1
+        self._streak = self._streak + 1 if solved else 0
+        self._ever = self._ever or solved
+        return Outcome(action, float(reward), solved, bool(terminated or truncated))
 
     def label(self) -> Label:
         """Return the expert's label of the present state; the expert is asked once a step."""
@@ -164,16 +164,15 @@ class GymEnv(Environment):
         else:
             self.world.restore(self.env, state.physics)
         self._seen, self._info = unflat(state.variation, self._seen), {}
-        self._count(state.step, state.streak, state.ever)
-        self._solved, self._label = state.streak > 0, None
+        self._count_from(state)
 
     @override
     def positions(self) -> dict[str, F64]:
-        return {name: np.asarray(at) for name, at in self.world.positions(self.env).items()}
+        return dict(self.world.positions(self.env))
 
-    def _count(self, step: int, streak: int, ever: bool) -> None:
-        self._step, self._streak = step, streak
-        self._ever = ever
+    def _count_from(self, state: State) -> None:
+        self._step, self._streak = state.step, state.streak
+        self._ever, self._label = state.ever, None
 
     def _numbers_seen(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return `agent_pos` and `environment_state` as the world gives them."""
@@ -310,13 +309,12 @@ class GymKind(WorldKind):
 
     def _task(self, config: EnvConfig) -> str:
         """Return the chosen task; "" if the world has only one."""
-        asked = str(config.task)
-        if not self._cls.tasks:
-            if asked not in (EnvConfig.task, "", _name(self._cls)):
-                raise UnknownName(f"task of {_name(self._cls)}", asked, [_name(self._cls)])
+        asked, name = str(config.task), _name(self._cls)
+        if not self._cls.tasks and asked in (EnvConfig.task, "", name):
             return ""
-        if asked not in self._cls.tasks:
-            raise UnknownName(f"task of {_name(self._cls)}", asked, self._cls.tasks)
+        known = self._cls.tasks or (name,)
+        if asked not in known:
+            raise UnknownName(f"task of {name}", asked, known)
         return asked
 
     @override
