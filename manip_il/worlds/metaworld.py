@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.errors import ManipError
 from manip_il.mdp import F64
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.gym.drawing import painted
-from manip_il.worlds.gym.environment import GymKind
+from manip_il.worlds.gym.environment import GymKind, installed
 from manip_il.worlds.gym.restoring import simulation
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 from manip_il.worlds.metaworld_experts import EXPERTS
@@ -53,7 +52,10 @@ class Metaworld(GymWorld):
 
     @override
     def make(self) -> Any:
-        metaworld, scripts = _package()
+        # its scripts warn of commands that they expect to be clipped
+        warnings.filterwarnings("ignore", module=r"metaworld\.")
+        metaworld = installed("metaworld", self.name, INSTALL)
+        scripts = import_module("metaworld.policies")
         only = metaworld.MT1(self.task, seed=SEED)
         env = only.train_classes[self.task](render_mode="rgb_array", camera_name=CAMERA)
         env.set_task(only.train_tasks[0])
@@ -93,18 +95,6 @@ class Metaworld(GymWorld):
 
 
 Metaworld.tasks = tuple(_known()["TASK_POLICY_MAPPING"])
-
-
-def _package() -> tuple[Any, Any]:
-    """Return the package and its module of scripts."""
-    # its scripts warn of commands that they expect to be clipped
-    warnings.filterwarnings("ignore", module=r"metaworld\.")
-    try:
-        return import_module("metaworld"), import_module("metaworld.policies")
-    except ModuleNotFoundError as error:
-        raise ManipError(
-            f"metaworld needs {error.name}, which is not installed: {INSTALL}"
-        ) from error
 
 
 class MetaworldKind(GymKind):

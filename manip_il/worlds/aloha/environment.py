@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from importlib import import_module
 from typing import Any, override
 
 import gymnasium
@@ -11,23 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.caching import cached_per_thread
-from manip_il.errors import ManipError, RenderError
+from manip_il.errors import RenderError
 from manip_il.mdp import F64, Label, State
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import LOOK_VERSION as DRAWN
 from manip_il.sim.render import REMEDY
 from manip_il.sim.view import simplify_meshes
-from manip_il.worlds.aloha import insertion, transfer
 from manip_il.worlds.aloha.expert import Arm, label
-from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, read_hand
+from manip_il.worlds.aloha.insertion import Insertion
+from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, phases, read_hand
+from manip_il.worlds.aloha.transfer import Transfer
 from manip_il.worlds.config import WORLDS, EnvConfig
 from manip_il.worlds.contract import GRIPPERS as GRIPPERS_OF
 from manip_il.worlds.contract import TWO_ARMS, EnvironmentSpec, Outcome
-from manip_il.worlds.gym.environment import GymActions, GymEnv, GymKind, coordinates
+from manip_il.worlds.gym.environment import GymActions, GymEnv, GymKind, coordinates, installed
 from manip_il.worlds.gym.restoring import WHOLE, physics_of
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 
-ALOHA_TASKS = {one.TASK.name: one.TASK for one in (transfer, insertion)}
+ALOHA_TASKS = {task.name: task for task in (Transfer, Insertion)}
 _JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
 # as in `lerobot/aloha_sim_*`
 NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)
@@ -69,7 +69,7 @@ class Aloha(GymWorld):
         task: A key of `ALOHA_TASKS`.
 
     Attributes:
-        about: The task.
+        about: The task, whose scenes are read from its states.
     """
 
     name = "aloha"
@@ -79,15 +79,12 @@ class Aloha(GymWorld):
     horizon = 400
     cameras = WORLDS["aloha"].cameras
 
-    def __init__(self, task: str = ""):
-        super().__init__(task)
-        self.about = ALOHA_TASKS[task]
-        self.instruction = self.about.instruction
-        self.phases = self.about.phases
-
     @override
     def make(self) -> Any:
-        env = _gym_aloha().AlohaEnv(self.about.own)
+        self.about = ALOHA_TASKS[self.task]
+        self.instruction = self.about.instruction
+        self.phases = phases(self.about)
+        env = installed("gym_aloha.env", self.name, INSTALL).AlohaEnv(self.about.own)
         self.physics, self._task = env._env.physics, env._env.task
         self.model, self.data = self.physics.model.ptr, self.physics.data.ptr
         # it would draw three pictures in every step, whatever is observed
@@ -148,7 +145,7 @@ class Aloha(GymWorld):
 
     def scene(self) -> AlohaScene:
         """Return the scene read from the state."""
-        return self.about.scene(self.about, self.model, self.data)
+        return self.about(self.model, self.data)
 
     def measured(self) -> F64:
         """Return joint positions [rad] and gripper openings, 0 to 1, (14,)."""
@@ -279,15 +276,6 @@ def _painter(task: str, *, fine: bool) -> Aloha:
         simplify_meshes(painter.model, _CELL)
         painter.model.vis.quality.shadowsize = _SHADOWS
     return painter
-
-
-def _gym_aloha() -> Any:
-    try:
-        return import_module("gym_aloha.env")
-    except ModuleNotFoundError as error:
-        raise ManipError(
-            f"{Aloha.name} needs {error.name}, which is not installed: {INSTALL}"
-        ) from error
 
 
 def _bounds(model: mujoco.MjModel) -> tuple[F64, F64]:

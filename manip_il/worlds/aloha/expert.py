@@ -13,7 +13,7 @@ from manip_il.caching import cached_per_thread
 from manip_il.mdp import F64, Label
 from manip_il.robots.geometry import turned_towards
 from manip_il.robots.ik import PoseProgram
-from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, Hand, HandTarget
+from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, Hand, HandTarget, phases
 
 ORIENTATION, POSTURE = 0.3, 0.003  # costs [1/rad], relative to 1 [1/m] for the position
 # forearm roll's cost at a straight wrist; peak's width, wrist up and down [rad]
@@ -40,7 +40,7 @@ def label(scene: AlohaScene, arms: Mapping[str, Arm], bias: F64, measured: F64) 
         return Label(measured, 0, False, 1.0, reason)
     action, names = list[float](), list[str]()
     for side, arm in arms.items():
-        rung = next(rung for rung in scene.task.rungs[side] if rung.holds(scene))
+        rung = next(rung for rung in scene.rungs[side] if rung.holds(scene))
         target = rung.target(scene)
         command = arm.command(scene.hands[side], target, bias)
         if command is None:
@@ -48,13 +48,13 @@ def label(scene: AlohaScene, arms: Mapping[str, Arm], bias: F64, measured: F64) 
             return Label(measured, 0, False, 1.0, reason)
         action += [*command, target.gripper]
         names.append(rung.name)
-    return Label(np.array(action), scene.task.phases.index(", ".join(names)), True, 0.0)
+    return Label(np.array(action), phases(type(scene)).index(", ".join(names)), True, 0.0)
 
 
 def _unsound(scene: AlohaScene, arms: Mapping[str, Arm]) -> str:
     if scene.arms_touch:
         return "the arms touch"
-    for name, side in scene.task.grasped.items():
+    for name, side in scene.grasped.items():
         position = scene.things[name].position
         if position[2] < FALLEN:
             return f"{name} off the table"

@@ -5,6 +5,7 @@ They meet in the air, and the peg goes in.
 
 import math
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from manip_il.worlds.aloha.ladder import (
     ARM,
     PITCH,
     AlohaScene,
-    AlohaTask,
     HandRung,
     HandTarget,
     Held,
@@ -44,6 +44,13 @@ CARRIED = 0.04  # longest step of a joint while an object is carried [rad]
 
 class Insertion(AlohaScene):
     """One state of the peg-insertion task."""
+
+    name = "AlohaInsertion-v0"
+    instruction = "Insert the peg into the socket."
+    own = "insertion"
+    objects: ClassVar = {PEG: Held(0.018, 0.0075, long=True), SOCKET: Held(0.026, 0.019, long=True)}
+    grasped: ClassVar = {PEG: "right", SOCKET: "left"}
+    inserted = (PEG, SOCKET)
 
     @cached_property
     def has(self) -> dict[str, bool]:
@@ -106,7 +113,7 @@ def _insert(scene: Insertion) -> HandTarget:
     )
 
 
-_RUNGS = {
+Insertion.rungs = {
     "left": (_carry("left", MEETING), *take_rungs("left", SOCKET, lambda one: one.grasps["left"])),
     "right": (
         HandRung(
@@ -117,13 +124,3 @@ _RUNGS = {
         *take_rungs("right", PEG, lambda one: one.grasps["right"]),
     ),
 }
-TASK = AlohaTask(
-    "AlohaInsertion-v0",
-    "Insert the peg into the socket.",
-    "insertion",
-    {PEG: Held(0.018, 0.0075, long=True), SOCKET: Held(0.026, 0.019, long=True)},
-    {PEG: "right", SOCKET: "left"},
-    Insertion,
-    _RUNGS,
-    (PEG, SOCKET),
-)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, NamedTuple
+from functools import cache, cached_property
+from typing import Any, ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
@@ -124,9 +124,14 @@ def always(scene: AlohaScene) -> bool:
     return True
 
 
-@dataclass(frozen=True)
-class AlohaTask:
-    """One task of `gym_aloha`.
+class AlohaScene:
+    """Hands, objects and contacts in one state of a task of `gym_aloha`.
+
+    A task is a subclass, which gives the attributes, and properties that its rungs need.
+
+    Args:
+        model: The environment's model.
+        data: The environment's data, with poses and contacts of the state.
 
     Attributes:
         name: Name of the task.
@@ -134,7 +139,6 @@ class AlohaTask:
         own: Its name in `gym_aloha`.
         objects: Object -> how it is held.
         grasped: Object -> the hand that takes it.
-        scene: Facts that the rungs read.
         rungs: Hand -> its rungs, the latest first.
         inserted: An object, and the object that it goes into; empty if nothing is inserted.
     """
@@ -142,37 +146,18 @@ class AlohaTask:
     name: str
     instruction: str
     own: str
-    objects: Mapping[str, Held]
-    grasped: Mapping[str, str]
-    scene: type[AlohaScene]
+    objects: ClassVar[Mapping[str, Held]]
+    grasped: ClassVar[Mapping[str, str]]
     rungs: Mapping[str, tuple[HandRung, ...]]
     inserted: tuple[str, ...] = ()
 
-    @cached_property
-    def phases(self) -> tuple[str, ...]:
-        """`none`, then `LEFT, RIGHT` for every pair of the two hands' rungs, earliest first."""
-        left, right = (self.rungs[side][::-1] for side in SIDES)
-        return ("none", *(f"{one.name}, {other.name}" for one in left for other in right))
-
-
-class AlohaScene:
-    """Hands, objects and contacts in one state.
-
-    A task's own subclass adds the facts that its rungs need.
-
-    Args:
-        task: The task, which names the objects.
-        model: The environment's model.
-        data: The environment's data, with poses and contacts of the state.
-    """
-
-    def __init__(self, task: AlohaTask, model: mujoco.MjModel, data: mujoco.MjData):
-        self.task, self._model = task, model
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        self._model = model
         self.hands = {side: read_hand(side, number, data) for number, side in enumerate(SIDES)}
         self.left, self.right = self.hands.values()
-        bodies = {name: data.body(name) for name in task.objects}
+        bodies = {name: data.body(name) for name in self.objects}
         self.things = {
-            name: Thing(body.xpos.copy(), body.xmat.reshape(3, 3).copy(), task.objects[name])
+            name: Thing(body.xpos.copy(), body.xmat.reshape(3, 3).copy(), self.objects[name])
             for name, body in bodies.items()
         }
         self._touching = model.geom_bodyid[data.contact.geom]  # (c, 2)
@@ -238,8 +223,8 @@ class AlohaScene:
                 found[f"{name}_from_{side}"] = hand.sees(thing.position)
                 touched = zip(SIDES, self.touches(side, name), strict=True)
                 found |= {f"{name}_touched.{side}.{finger}": touches for finger, touches in touched}
-        if self.task.inserted:
-            one, other = self.task.inserted
+        if self.inserted:
+            one, other = self.inserted
             inner, outer = self.things[one], self.things[other]
             found[f"{one}_from_{other}"] = outer.frame.T @ (inner.position - outer.position)
             found[f"{one}_ahead_in_{other}"] = outer.frame.T @ inner.frame[:, 0]
@@ -248,6 +233,13 @@ class AlohaScene:
     def _meet(self, one: str, other: str) -> bool:
         pair = {self._model.body(one).id, self._model.body(other).id}
         return any(pair == {*bodies} for bodies in self._touching.tolist())
+
+
+@cache
+def phases(task: type[AlohaScene]) -> tuple[str, ...]:
+    """Return `none`, then `LEFT, RIGHT` for every pair of the two hands' rungs, earliest first."""
+    left, right = (task.rungs[side][::-1] for side in SIDES)
+    return ("none", *(f"{one.name}, {other.name}" for one in left for other in right))
 
 
 def cross(a: F64, b: F64) -> F64:

@@ -1,6 +1,7 @@
 """The right hand takes the cube from the table and hands it to the left one, in the air."""
 
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from manip_il.worlds.aloha.ladder import (
     OPEN,
     PITCH,
     AlohaScene,
-    AlohaTask,
     HandRung,
     HandTarget,
     Held,
@@ -45,6 +45,12 @@ PARTING = 0.03
 
 class Transfer(AlohaScene):
     """One state of the cube-transfer task."""
+
+    name = "AlohaTransferCube-v0"
+    instruction = "Pick up the cube with the right arm and transfer it to the left arm."
+    own = "transfer_cube"
+    objects: ClassVar = {CUBE: Held(0.027, 0.017)}
+    grasped: ClassVar = {CUBE: "right"}
 
     @cached_property
     def cube(self) -> F64:
@@ -117,7 +123,7 @@ def _wait(scene: Transfer) -> HandTarget:
     return HandTarget(MEETING + WAITING, ahead_across(X, Z), OPEN, FAST)
 
 
-_RUNGS = {
+Transfer.rungs = {
     "left": (
         HandRung(
             "hold",
@@ -138,12 +144,3 @@ _RUNGS = {
         *take_rungs("right", CUBE, lambda one: one.right_grasp),
     ),
 }
-TASK = AlohaTask(
-    "AlohaTransferCube-v0",
-    "Pick up the cube with the right arm and transfer it to the left arm.",
-    "transfer_cube",
-    {CUBE: Held(0.027, 0.017)},
-    {CUBE: "right"},
-    Transfer,
-    _RUNGS,
-)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from importlib import import_module
 from importlib.metadata import entry_points, packages_distributions, version
 from pathlib import Path
 from typing import Any, ClassVar, override
@@ -177,12 +178,16 @@ class GymEnv(Environment):
     def _numbers_seen(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return `agent_pos` and `environment_state` as the world gives them."""
         found = self.world.observe(self.env, self._seen)
-        if not isinstance(found, Mapping) or not found.keys() & {AGENT, AROUND}:
-            raise UsageError(
-                f"observe of {_name(self.world)} returned {checks.shorten(found)}; expected a"
-                f" mapping with {AGENT}, {AROUND} or both"
-            )
-        return (_numbers(self.world, found, AGENT), _numbers(self.world, found, AROUND))
+        try:
+            if found.keys() & {AGENT, AROUND}:
+                mine = np.ravel(np.asarray(found.get(AGENT, ()), np.float32))
+                return mine, np.ravel(np.asarray(found.get(AROUND, ()), np.float32))
+        except (AttributeError, TypeError, ValueError):
+            pass
+        raise UsageError(
+            f"observe of {_name(self.world)} returned {checks.shorten(found)}; expected a mapping"
+            f" with the numbers {AGENT}, {AROUND} or both"
+        )
 
     def _checked(self, given: Any) -> Label:
         if isinstance(given, Label):
@@ -384,6 +389,23 @@ def made(world: GymWorld) -> gymnasium.Env[Any, Any]:
     return env
 
 
+def installed(module: str, world: str, how: str) -> Any:
+    """Return a module of the package that a world comes from.
+
+    Args:
+        module: Its name.
+        world: The world's.
+        how: The command that installs the package.
+
+    Raises:
+        ManipError: if something is not installed.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise ManipError(f"{world} needs {error.name}, which is not installed: {how}") from error
+
+
 def settings_of(world: GymWorld, env: gymnasium.Env[Any, Any] | None) -> dict[str, Any]:
     """Return rate [Hz] and horizon of a world, from its class or its environment.
 
@@ -421,16 +443,6 @@ def _names(world: GymWorld, key: str, count: int) -> tuple[str, ...]:
     if given and len(given) != count:
         raise UsageError(f"names of {key} of {_name(world)} are {len(given)}; expected {count}")
     return given or tuple(f"{key}_{place}" for place in range(count))
-
-
-def _numbers(world: GymWorld, found: Mapping[str, Any], key: str) -> NDArray[np.float32]:
-    """Return the numbers of a key of what `observe` returned, (k,)."""
-    try:
-        return np.ravel(np.asarray(found.get(key, ()), np.float32))
-    except (TypeError, ValueError) as error:
-        raise UsageError(
-            f"{key} of {_name(world)} is {checks.shorten(found[key])}; expected numbers"
-        ) from error
 
 
 def _overrides(world: GymWorld, name: str) -> bool:
