@@ -107,7 +107,10 @@ class Aloha(GymWorld):
 
     @override
     def act(self, env: Any, seen: F64) -> Label:
-        return label(self.scene(), self._arms, self.data.qfrc_bias, self.measured())
+        found = label(self.scene(), self._arms, self.data.qfrc_bias)
+        if isinstance(found, Label):
+            return found
+        return Label(self.measured(), 0, False, 1.0, found)
 
     @override
     def progress(self, env: Any, info: Mapping[str, Any]) -> float:

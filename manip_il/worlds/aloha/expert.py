@@ -26,26 +26,23 @@ CREEPS = 0.95  # share of the breakaway lead below which a joint creeps
 BREAKAWAY = 1.5  # step of a joint per lead beyond it
 
 
-def label(scene: AlohaScene, arms: Mapping[str, Arm], bias: F64, measured: F64) -> Label:
-    """Return the label of one state.
+def label(scene: AlohaScene, arms: Mapping[str, Arm], bias: F64) -> Label | str:
+    """Return the label of one state, or why there is no sound action.
 
     Args:
         scene: The state.
         arms: Side -> its arm.
         bias: Forces of gravity and motion on all joints of the model, (nv,).
-        measured: Joint positions [rad] and gripper openings, (14,), at which the arms are held if
-            there is no sound action.
     """
     if reason := _unsound(scene, arms):
-        return Label(measured, 0, False, 1.0, reason)
+        return reason
     action, names = list[float](), list[str]()
     for side, arm in arms.items():
         rung = next(rung for rung in scene.rungs[side] if rung.holds(scene))
         target = rung.target(scene)
         command = arm.command(scene.hands[side], target, bias)
         if command is None:
-            reason = f"inverse kinematics of the {side} arm has no solution"
-            return Label(measured, 0, False, 1.0, reason)
+            return f"inverse kinematics of the {side} arm has no solution"
         action += [*command, target.gripper]
         names.append(rung.name)
     return Label(np.array(action), phases(type(scene)).index(", ".join(names)), True, 0.0)

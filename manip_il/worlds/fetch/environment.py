@@ -93,7 +93,7 @@ class Fetch(GymWorld):
 
     @override
     def state(self, env: Any) -> F64:
-        """Return MuJoCo's state, and the positions and velocities that the poses follow from."""
+        """Return MuJoCo's state, and the positions and velocities that poses follow from, (p,)."""
         inner = env.unwrapped
         # with closed fingers, the environment's step ends with computing all poses
         posed = _motion(inner.data) if inner.block_gripper else self._posed
@@ -102,9 +102,10 @@ class Fetch(GymWorld):
     @override
     def restore(self, env: Any, state: F64) -> None:
         model, data = env.unwrapped.model, env.unwrapped.data
-        physics, self._posed = np.split(state, [mujoco.mj_stateSize(model, WHOLE)])
+        size = mujoco.mj_stateSize(model, WHOLE)
+        physics, self._posed = state[:size], state[size:]
         mujoco.mj_setState(model, data, physics, WHOLE)
-        data.qpos[:], data.qvel[:] = np.split(self._posed, [model.nq])
+        data.qpos[:], data.qvel[:] = self._posed[: model.nq], self._posed[model.nq :]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         mujoco.mj_setState(model, data, physics, WHOLE)
