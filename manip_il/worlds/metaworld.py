@@ -54,8 +54,9 @@ class Metaworld(GymWorld):
     def make(self) -> Any:
         # its scripts warn of commands that they expect to be clipped
         warnings.filterwarnings("ignore", module=r"metaworld\.")
-        metaworld = installed("metaworld", self.name, INSTALL)
-        scripts = import_module("metaworld.policies")
+        with installed(self, INSTALL):
+            metaworld = import_module("metaworld")
+            scripts = import_module("metaworld.policies")
         only = metaworld.MT1(self.task, seed=SEED)
         env = only.train_classes[self.task](render_mode="rgb_array", camera_name=CAMERA)
         env.set_task(only.train_tasks[0])

@@ -18,9 +18,9 @@ from manip_il.learn.action_spaces import conversion_for
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
+from manip_il.worlds.aloha import environment
 from manip_il.worlds.aloha.environment import INSTALL, Aloha, AlohaEnv
 from manip_il.worlds.config import WORLDS, EnvConfig
-from manip_il.worlds.gym import environment
 from manip_il.worlds.table import env_spec, make_config, make_env, make_expert
 
 ALOHA = Aloha.name

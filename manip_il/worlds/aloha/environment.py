@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from importlib import import_module
 from typing import Any, override
 
 import gymnasium
@@ -84,7 +85,8 @@ class Aloha(GymWorld):
         self.about = ALOHA_TASKS[self.task]
         self.instruction = self.about.instruction
         self.phases = phases(self.about)
-        env = installed("gym_aloha.env", self.name, INSTALL).AlohaEnv(self.about.own)
+        with installed(self, INSTALL):
+            env = import_module("gym_aloha.env").AlohaEnv(self.about.own)
         self.physics, self._task = env._env.physics, env._env.task
         self.model, self.data = self.physics.model.ptr, self.physics.data.ptr
         # it would draw three pictures in every step, whatever is observed

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from importlib import import_module
 from importlib.metadata import entry_points, packages_distributions, version
 from pathlib import Path
 from typing import Any, ClassVar, override
@@ -389,21 +389,18 @@ def made(world: GymWorld) -> gymnasium.Env[Any, Any]:
     return env
 
 
-def installed(module: str, world: str, how: str) -> Any:
-    """Return a module of the package that a world comes from.
+@contextmanager
+def installed(world: GymWorld, how: str) -> Iterator[None]:
+    """Import the package that a world comes from.
 
-    Args:
-        module: Its name.
-        world: The world's.
-        how: The command that installs the package.
-
-    Raises:
-        ManipError: if something is not installed.
+    Raises `ManipError` with the command that installs it if something is not installed.
     """
     try:
-        return import_module(module)
+        yield
     except ModuleNotFoundError as error:
-        raise ManipError(f"{world} needs {error.name}, which is not installed: {how}") from error
+        raise ManipError(
+            f"{_name(world)} needs {error.name}, which is not installed: {how}"
+        ) from error
 
 
 def settings_of(world: GymWorld, env: gymnasium.Env[Any, Any] | None) -> dict[str, Any]:
