@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from manip_il.worlds.aloha.environment import AlohaEnv
-from manip_il.worlds.aloha.expert import AlohaExpert
+from manip_il.worlds.aloha.environment import Aloha, AlohaEnv
 
 OUTPUT = Path(__file__).parent.parent / "docs" / "two_arms.gif"
 HEIGHT, WIDTH, CAMERA = 200, 320, "angle"
@@ -43,22 +42,21 @@ KNOCKS = (
 
 def film(knock: Knock) -> list[Image.Image]:
     """Return the frames of one episode, from its start until the task is solved."""
-    env, expert = AlohaEnv(knock.task), AlohaExpert(knock.task)
+    world = Aloha(knock.task)
+    env = AlohaEnv(world)
     env.start(knock.seed)
-    body = env.model.body(knock.thing).id
+    body = world.model.body(knock.thing).id
     frames: list[Image.Image] = []
     left, caption, solved = knock.steps, 0, False
     for step in range(HORIZON):
-        label = expert.label(env.get_state())
-        phase = env.task.phases[label.phase]
+        label = env.label()
+        phase = world.phases[label.phase]
         pushed = left > 0 and (left < knock.steps or phase == knock.phase)
         left, caption = left - pushed, SAID if pushed else caption - 1
-        env.data.xfrc_applied[body, :3] = knock.force if pushed else 0.0
+        world.data.xfrc_applied[body, :3] = knock.force if pushed else 0.0
         if step % EVERY == 0 or solved:
             frames.append(
-                captioned(
-                    env.draw(height=HEIGHT, width=WIDTH, camera_id=CAMERA), phase, caption > 0
-                )
+                captioned(world.physics.render(HEIGHT, WIDTH, CAMERA), phase, caption > 0)
             )
         if solved:
             return frames

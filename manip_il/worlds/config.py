@@ -24,12 +24,12 @@ class Listed(NamedTuple):
 WORLD_GROUP = "manip_il.worlds"  # entry points: a world's name, and its `GymWorld`
 WORLDS: dict[NameOrPath, Listed] = {
     "fetch_stock": Listed(
-        "manip_il.worlds.fetch.expert",
+        "manip_il.worlds.fetch.environment",
         "gymnasium-robotics' Fetch",
         ("FetchReach-v4", "FetchPush-v4", "FetchPickAndPlace-v4"),
     ),
     "aloha": Listed(
-        "manip_il.worlds.aloha.expert",
+        "manip_il.worlds.aloha.environment",
         "gym_aloha's two arms",
         ("AlohaTransferCube-v0", "AlohaInsertion-v0"),
         ("top", "angle", "front_close", "left_pillar", "right_pillar", "left_wrist", "right_wrist"),

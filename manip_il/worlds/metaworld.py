@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import pickle
 import warnings
-from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -20,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.errors import ManipError
 from manip_il.mdp import F64
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.gym.drawing import painted
-from manip_il.worlds.gym.environment import GymKind
+from manip_il.worlds.gym.environment import GymKind, installed
 from manip_il.worlds.gym.restoring import simulation
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 from manip_il.worlds.metaworld_experts import EXPERTS
@@ -52,14 +50,13 @@ class Metaworld(GymWorld):
     horizon = 500
     cameras = (CAMERA,)
 
-    def __init__(self, task: str = ""):
-        super().__init__(task)
-        self.instruction = _known()["TASK_DESCRIPTIONS"].get(task, "")
-        self._script: Any = None
-
     @override
     def make(self) -> Any:
-        metaworld, scripts = _package()
+        # its scripts warn of commands that they expect to be clipped
+        warnings.filterwarnings("ignore", module=r"metaworld\.")
+        with installed(self, INSTALL):
+            metaworld = import_module("metaworld")
+            scripts = import_module("metaworld.policies")
         cls = metaworld.ALL_V3_ENVIRONMENTS[self.task]
         env = cls(render_mode="rgb_array", camera_name=CAMERA)
         # As a task of `MT1`, which takes seconds to draw 50 starts. None of these is needed.
@@ -68,8 +65,8 @@ class Metaworld(GymWorld):
         env.model.camera(CAMERA).pos[:] = CAMERA_AT
         env._freeze_rand_vec = False
         env.seeded_rand_vec = True
-        script = _known()["TASK_POLICY_MAPPING"][self.task]
-        self._script = getattr(scripts, script)()
+        self.instruction = _known()["TASK_DESCRIPTIONS"][self.task]
+        self._script = getattr(scripts, _known()["TASK_POLICY_MAPPING"][self.task])()
         return env
 
     @override
@@ -80,10 +77,6 @@ class Metaworld(GymWorld):
     @override
     def observe(self, env: Any, seen: F64) -> dict[str, F64]:
         return {AGENT: seen[:ROBOT], AROUND: seen[ROBOT:]}
-
-    @override
-    def solved(self, env: Any, info: Mapping[str, Any]) -> bool:
-        return bool(info.get("success", False))
 
     @override
     def act(self, env: Any, seen: F64) -> F64:
@@ -105,18 +98,6 @@ class Metaworld(GymWorld):
 
 Metaworld.tasks = tuple(_known()["TASK_POLICY_MAPPING"])
 Metaworld.groups = {name: tuple(tasks) for name, tasks in _known()["DIFFICULTY_TO_TASKS"].items()}
-
-
-def _package() -> tuple[Any, Any]:
-    """Return the package and its module of scripts."""
-    # its scripts warn of commands that they expect to be clipped
-    warnings.filterwarnings("ignore", module=r"metaworld\.")
-    try:
-        return import_module("metaworld"), import_module("metaworld.policies")
-    except ModuleNotFoundError as error:
-        raise ManipError(
-            f"metaworld needs {error.name}, which is not installed: {INSTALL}"
-        ) from error
 
 
 class MetaworldKind(GymKind):

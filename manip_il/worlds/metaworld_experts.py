@@ -23,6 +23,7 @@ CLEARANCE = 0.1  # of the hand above what it approaches [m]
 EMPTY = 0.85  # opening above which nothing is held
 CLOSING = 0.01  # change of the opening in a step, above which the gripper still closes
 UP = np.array([0.0, 0.0, 1.0])
+Expert = Callable[[F64], F64]  # the action (4,) for what is seen, (39,)
 
 
 def reach(seen: F64, target: F64, effort: float) -> F64:
@@ -143,12 +144,6 @@ def _disassemble(seen: F64) -> F64:
     return grasp(seen, at, seen[:3] + 0.1 * UP, 0.02, 0.025)
 
 
-def _basketball(seen: F64) -> F64:
-    """Carry the ball into the hoop."""
-    ball = seen[4:7]
-    return grasp(seen, ball + 0.035 * UP, over(seen, ball, seen[36:39], 0.07), 0.03)
-
-
 def _hammer(seen: F64) -> F64:
     """Hit the nail with the hammer's head."""
     tool = seen[4:7]
@@ -178,12 +173,6 @@ def _coffee(seen: F64) -> F64:
     return grasp(seen, mug + 0.05 * upright + 0.015 * UP, to, 0.03)
 
 
-def _box_close(seen: F64) -> F64:
-    """Put the lid on the box."""
-    lid, box = seen[4:7], seen[36:39]
-    return grasp(seen, lid + 0.07 * UP, over(seen, lid, box, 0.05))
-
-
 def _peg_insert(seen: F64) -> F64:
     """Push the peg into the hole."""
     peg, goal = seen[4:7], seen[36:39]
@@ -193,34 +182,32 @@ def _peg_insert(seen: F64) -> F64:
     return grasp(seen, peg + 0.02 * UP, seen[:3] + left, 0.03)
 
 
+def _place(grip: float, height: float, around: float = 0.02) -> Expert:
+    """Return an expert that carries an object up, over the goal, and down.
+
+    Args:
+        grip: Height of the hand above the object in which it grasps [m].
+        height: Of the way above the goal [m].
+        around: Most error of the grasping hand in the plane [m].
+    """
+
+    def act(seen: F64) -> F64:
+        thing, goal = seen[4:7], seen[36:39]
+        return grasp(seen, thing + grip * UP, over(seen, thing, goal, height), around)
+
+    return act
+
+
 def _carry(seen: F64) -> F64:
     """Carry an object straight to the goal."""
     thing = seen[4:7]
     return grasp(seen, thing + 0.03 * UP, seen[:3] + seen[36:39] - thing, 0.03)
 
 
-def _bin_picking(seen: F64) -> F64:
-    """Carry the cube into the other bin."""
-    cube, goal = seen[4:7], seen[36:39]
-    return grasp(seen, cube + 0.04 * UP, over(seen, cube, goal, 0.15, 0.03))
-
-
 def _wall(seen: F64) -> F64:
     """Carry the object over the wall."""
     thing, goal = seen[4:7], seen[36:39]
     return grasp(seen, thing + 0.03 * UP, over(seen, thing, goal, 0.3 - goal[2]))
-
-
-def _shelf_place(seen: F64) -> F64:
-    """Put the block on the shelf."""
-    block, goal = seen[4:7], seen[36:39]
-    return grasp(seen, block + 0.03 * UP, over(seen, block, goal, 0.03))
-
-
-def _pick_out(seen: F64) -> F64:
-    """Lift the puck out of the hole."""
-    puck, goal = seen[4:7], seen[36:39]
-    return grasp(seen, puck + 0.03 * UP, over(seen, puck, goal, 0.0))
 
 
 def _peg_unplug(seen: F64) -> F64:
@@ -270,11 +257,10 @@ def _door_open(seen: F64) -> F64:
     return approach(seen, behind, CLOSED, 0.15)
 
 
-EXPERTS: dict[str, Callable[[F64], F64]] = {
+EXPERTS: dict[str, Expert] = {
     "assembly-v3": _assembly,
-    "basketball-v3": _basketball,
-    "bin-picking-v3": _bin_picking,
-    "box-close-v3": _box_close,
+    "basketball-v3": _place(0.035, 0.07, around=0.03),  # into the hoop
+    "box-close-v3": _place(0.07, 0.05),  # the lid on the box
     "coffee-pull-v3": _coffee,
     "coffee-push-v3": _coffee,
     "disassemble-v3": _disassemble,
@@ -284,13 +270,13 @@ EXPERTS: dict[str, Callable[[F64], F64]] = {
     "handle-pull-side-v3": _handle_pull_side,
     "peg-insert-side-v3": _peg_insert,
     "peg-unplug-side-v3": _peg_unplug,
-    "pick-out-of-hole-v3": _pick_out,
+    "pick-out-of-hole-v3": _place(0.03, 0.0),  # out of the hole
     "pick-place-v3": _carry,
     "pick-place-wall-v3": _wall,
     "push-v3": _carry,
     "push-wall-v3": _wall,
     "push-back-v3": _carry,
-    "shelf-place-v3": _shelf_place,
+    "shelf-place-v3": _place(0.03, 0.03),
     "stick-pull-v3": _stick_pull,
     "stick-push-v3": _stick_push,
     "sweep-v3": _carry,

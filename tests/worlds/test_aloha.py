@@ -19,11 +19,11 @@ from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.aloha import environment
-from manip_il.worlds.aloha.environment import INSTALL, AlohaEnv
+from manip_il.worlds.aloha.environment import INSTALL, Aloha, AlohaEnv
 from manip_il.worlds.config import WORLDS, EnvConfig
 from manip_il.worlds.table import env_spec, make_config, make_env, make_expert
 
-ALOHA = AlohaEnv.robot
+ALOHA = Aloha.name
 TRANSFER, INSERTION = WORLDS[ALOHA].tasks
 every_task = pytest.mark.parametrize("task", [TRANSFER, INSERTION])
 SMALL = CameraConfig(("top",), 48, 64)
@@ -31,6 +31,10 @@ SMALL = CameraConfig(("top",), 48, 64)
 
 def config(task: str, **settings: int) -> EnvConfig:
     return make_config(ALOHA, task, **settings)
+
+
+def made(task: str) -> AlohaEnv:
+    return AlohaEnv(Aloha(task))
 
 
 def theirs(task: str) -> Any:
@@ -44,7 +48,7 @@ def solve(env: AlohaEnv, noise: float = 0.0, seed: int = 0) -> tuple[list[State]
     A share of the actions is random.
     """
     expert, rng, states = (
-        make_expert(config(env.task.name)),
+        make_expert(config(env.spec.task)),
         np.random.default_rng(seed),
         list[State](),
     )
@@ -53,7 +57,7 @@ def solve(env: AlohaEnv, noise: float = 0.0, seed: int = 0) -> tuple[list[State]
         states.append(env.get_state())
         random = rng.random() < noise
         action = (
-            env.actions.random_near(env.measured(), rng)
+            env.actions.random_near(env.world.measured(), rng)
             if random
             else expert.label(states[-1]).action
         )
@@ -63,7 +67,7 @@ def solve(env: AlohaEnv, noise: float = 0.0, seed: int = 0) -> tuple[list[State]
 
 @every_task
 def test_it_is_the_environment_that_gymnasium_makes(task: str):
-    other, ours, expert = theirs(task), AlohaEnv(task), make_expert(config(task))
+    other, ours, expert = theirs(task), made(task), make_expert(config(task))
     # a second each
     other.unwrapped._env.physics.render = lambda **_: np.zeros((480, 640, 3), np.uint8)
     seen, _ = other.reset(seed=4_000_007)
@@ -98,7 +102,7 @@ def test_a_picture_depends_on_the_state_alone():
 
 @every_task
 def test_the_expert_solves_it_and_a_restored_state_goes_on_bit_for_bit(task: str):
-    env, other = AlohaEnv(task), AlohaEnv(task)
+    env, other = made(task), made(task)
     env.start(1)
     states, solved = solve(env)
     assert solved
@@ -119,7 +123,7 @@ def test_the_expert_solves_it_and_a_restored_state_goes_on_bit_for_bit(task: str
 @every_task
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_the_expert_solves_what_it_has_not_seen(task: str, noise: float):
-    env, solved = AlohaEnv(task), 0
+    env, solved = made(task), 0
     for seed in stream_seeds("training", 12):
         env.start(seed)
         solved += solve(env, noise, seed)[1]
@@ -127,8 +131,9 @@ def test_the_expert_solves_what_it_has_not_seen(task: str, noise: float):
 
 
 def moved(env: AlohaEnv, name: str, place: tuple[float, float, float]) -> State:
-    address = env.model.jnt_qposadr[env.model.body(name).jntadr[0]]
-    env.data.qpos[address : address + 3] = place
+    model = env.world.model
+    address = model.jnt_qposadr[model.body(name).jntadr[0]]
+    env.world.data.qpos[address : address + 3] = place
     return env.get_state()
 
 
@@ -141,17 +146,20 @@ def moved(env: AlohaEnv, name: str, place: tuple[float, float, float]) -> State:
     ],
 )
 def test_a_state_without_a_sound_label_says_why_and_holds_still(task, name, place, reason):
-    env = AlohaEnv(task)
+    env = made(task)
     label = make_expert(config(task)).label(moved(env, name, place))
     assert (label.valid, label.reason, label.phase) == (False, reason, 0)
-    assert np.allclose(label.action, env.measured())
+    assert np.allclose(label.action, env.world.measured())
 
 
 def test_arms_that_touch_have_no_label():
-    env = AlohaEnv(TRANSFER)
-    env.data.qpos[[0, 8]] = 0.0
+    env = made(TRANSFER)
+    env.world.data.qpos[[0, 8]] = 0.0
     for joint in (1, 9):
-        env.data.qpos[joint : joint + 2] = 0.55, 0.2  # both arms straight ahead, into each other
+        env.world.data.qpos[joint : joint + 2] = (
+            0.55,
+            0.2,
+        )  # both arms straight ahead, into each other
     label = make_expert(config(TRANSFER)).label(env.get_state())
     assert (label.valid, label.reason) == (False, "the arms touch")
 
@@ -176,12 +184,12 @@ def test_names_and_numbers_are_those_of_lerobots_datasets(task: str):
 
 @every_task
 def test_positions_are_those_of_the_observation(task: str):
-    env = AlohaEnv(task)
+    env = made(task)
     row = dict(
         zip(env.spec.environment_state_names, env.observe().environment_state.tolist(), strict=True)
     )
     found = positions(config(task), env.get_state().to_vector())
-    first = next(iter(env.task.objects))
+    first = next(iter(env.world.about.objects))
     for name, observed in {"hand": "right_ee", "object": first}.items():
         assert found[name] == pytest.approx([row[f"{observed}.{axis}"] for axis in "xyz"], abs=1e-4)
 
@@ -199,25 +207,25 @@ def test_an_episode_ends_as_the_environments_do(task: str):
 def test_a_redrawn_scene_has_free_objects_elsewhere_and_arms_that_take_along_or_drop_what_they_hold(
     task: str,
 ):
-    env, expert, rng = AlohaEnv(task), make_expert(config(task)), np.random.default_rng(0)
+    env, expert, rng = made(task), make_expert(config(task)), np.random.default_rng(0)
     env.start(4)
     states, _ = solve(env)
     for state in (states[10], states[-20]):
         env.set_state(state)
-        before = env.scene()
+        before = env.world.scene()
         held = {
             name: side
             for side in before.hands
             for name in before.things
             if any(before.touches(side, name))
         }
-        assert len(held) == (0 if state is states[10] else len(env.task.grasped))
+        assert len(held) == (0 if state is states[10] else len(env.world.about.grasped))
         found = [one for _ in range(25) if (one := env.redrawn(state, rng)) is not None]
         moved, anew, kept = 0, 0, list[bool]()
         for one in found:
             assert expert.label(one).valid
             env.set_state(one)
-            after = env.scene()
+            after = env.world.scene()
             moved += any(
                 (after.hands[side].q != before.hands[side].q).any() for side in before.hands
             )
@@ -232,7 +240,7 @@ def test_a_redrawn_scene_has_free_objects_elsewhere_and_arms_that_take_along_or_
                     anew += bool((thing.position[:2] != before.things[name].position[:2]).all())
         assert 0 < moved < len(found)
         assert not held or 0 < len(kept) - sum(kept) < 0.3 * len(kept)  # some are dropped
-        assert (anew > 0) == (len(held) < len(env.task.objects))
+        assert (anew > 0) == (len(held) < len(env.world.about.objects))
 
 
 @pytest.mark.gl
@@ -244,8 +252,8 @@ def test_recorded_pictures_have_the_size_asked_for():
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"control_hz": 20}, "control_hz is 20; aloha is unmodified, expected 50"),
-        ({"object": "sphere:0.04"}, "object is sphere:0.04; aloha is unmodified"),
+        ({"control_hz": 20}, "control_hz is 20; aloha has its own, expected 50"),
+        ({"object": "sphere:0.04"}, "object is sphere:0.04; aloha has its own"),
         ({"task": "pick_place"}, "unknown task of aloha 'pick_place'"),
     ],
 )
@@ -264,7 +272,7 @@ def test_another_robot_or_camera_is_refused():
 
 def test_a_state_of_the_other_task_is_refused():
     with pytest.raises(MismatchError, match="size of the state"):
-        AlohaEnv(TRANSFER).set_state(AlohaEnv(INSERTION).get_state())
+        made(TRANSFER).set_state(made(INSERTION).get_state())
 
 
 def test_without_the_package_one_line_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch):
@@ -273,7 +281,7 @@ def test_without_the_package_one_line_says_how_to_install_it(monkeypatch: pytest
 
     monkeypatch.setattr(environment, "import_module", missing)
     with pytest.raises(ManipError, match=re.escape(INSTALL)):
-        AlohaEnv(TRANSFER)
+        made(TRANSFER)
 
 
 def test_the_line_installs_what_the_tests_use():

@@ -173,7 +173,7 @@ def test_pictures_are_of_the_state_alone(tmp_path):
         (("return Line()", "return None"), r"^make of point returned None; expected a gymnasium"),
         (
             ("return self.at, {}", "return 'x', {}"),
-            r"^agent_pos of point is 'x'; expected numbers$",
+            r"^observe of point returned \{'agent_pos': 'x'\}; expected a mapping with",
         ),
         (("class Point", "class _Point"), r"own\.py: none; expected one subclass of manip_il\.Gym"),
         (("    horizon", "    names = {'action': ('a', 'b')}\n    horizon"), r"are 2; expected 1$"),

@@ -7,6 +7,6 @@
   six joints [rad] and the gripper, 0 closed to 1 open. `observation.images.top`: the environment's
   own picture, at the size asked for.
 - A state is MuJoCo's integration state: after a step all poses are up to date.
-- The expert is one ladder per hand over what `AlohaScene` reads from a state. A task is one file:
-  the facts that its rungs need, as properties of an `AlohaScene`, and the rungs.
+- The expert is one ladder per hand over what `AlohaScene` reads from a state. A task is one file
+  and one `AlohaScene`, with the facts that its rungs need, as properties, and the rungs.
 """

@@ -1,30 +1,37 @@
-"""One environment of `gym_aloha`, unmodified, behind the contract of a world."""
+"""The environments of `gym_aloha`, unmodified, as a world."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib import import_module
 from typing import Any, override
 
+import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.caching import cached_per_thread
-from manip_il.errors import ManipError, RenderError
-from manip_il.mdp import F64, Observation, State
-from manip_il.robots.action_space import ActionSpace
+from manip_il.errors import RenderError
+from manip_il.mdp import F64, Label, State
 from manip_il.sim.config import CameraConfig
+from manip_il.sim.render import LOOK_VERSION as DRAWN
 from manip_il.sim.render import REMEDY
 from manip_il.sim.view import simplify_meshes
-from manip_il.worlds.aloha import insertion, transfer
-from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, read_hand
+from manip_il.worlds.aloha.expert import Arm, label
+from manip_il.worlds.aloha.insertion import Insertion
+from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, phases, read_hand
+from manip_il.worlds.aloha.transfer import Transfer
+from manip_il.worlds.config import WORLDS, EnvConfig
 from manip_il.worlds.contract import GRIPPERS as GRIPPERS_OF
-from manip_il.worlds.contract import TWO_ARMS
-from manip_il.worlds.packaged import WHOLE, PackagedEnv, coordinates
+from manip_il.worlds.contract import TWO_ARMS, EnvironmentSpec, Outcome
+from manip_il.worlds.gym.environment import GymActions, GymEnv, GymKind, coordinates, installed
+from manip_il.worlds.gym.restoring import WHOLE, physics_of
+from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 
-ALOHA_TASKS = {one.TASK.name: one.TASK for one in (transfer, insertion)}
+ALOHA_TASKS = {task.name: task for task in (Transfer, Insertion)}
 _JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
 # as in `lerobot/aloha_sim_*`
-ALOHA_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)
+NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)
 INSTALL = (
     "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10"
     " lxml==6.1.3"
@@ -43,12 +50,12 @@ _STAYS, _ELSEWHERE = 0.4, 0.08
 _COARSE = 240
 # least cell size of simplified meshes [m]; size of the shadow map [pixels]
 _CELL, _SHADOWS = 0.004, 1024
-_BLANK = np.zeros((1, 1, 3), np.uint8)
 
 
-class AlohaActions(ActionSpace):
+class AlohaActions(GymActions):
     """Joint targets [rad] and gripper commands, 0 to 1, of two arms."""
 
+    @override
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
         """Draw joint targets near the measured joints in `state` (14,), the grippers anywhere."""
         action = np.asarray(state, np.float64) + rng.uniform(-LONGEST, LONGEST, len(self))
@@ -56,78 +63,64 @@ class AlohaActions(ActionSpace):
         return action
 
 
-class AlohaEnv(PackagedEnv):
-    """An environment of `gym_aloha`.
+class Aloha(GymWorld):
+    """One task of `gym_aloha`; its `step` and `reset` return an empty observation.
 
     Args:
         task: A key of `ALOHA_TASKS`.
-        cameras: Cameras rendered in every step; None for none.
 
-    Raises:
-        ManipError: if the package is not installed.
+    Attributes:
+        about: The task, whose scenes are read from its states.
     """
 
-    robot, action_meaning = "aloha", TWO_ARMS
+    name = "aloha"
+    tasks = tuple(ALOHA_TASKS)
     # as in LeRobot's environment; the one registered with gymnasium has 300 steps
-    control_hz, horizon = 50, 400
-    can = ("restored", "redrawn", "drawn")
-    ends_solved = True
+    fps = 50
+    horizon = 400
+    cameras = WORLDS["aloha"].cameras
 
-    def __init__(self, task: str, cameras: CameraConfig | None = None):
-        self.task, self._cameras = ALOHA_TASKS[task], cameras
-        self._env = _gym_aloha().AlohaEnv(self.task.own, obs_type="pixels_agent_pos")
-        self.physics = self._env._env.physics
-        self.draw = self.physics.render
-        # it would draw three pictures in every step, whatever is observed
-        self.physics.render = lambda **_: _BLANK
+    @override
+    def make(self) -> Any:
+        self.about = ALOHA_TASKS[self.task]
+        self.instruction = self.about.instruction
+        self.phases = phases(self.about)
+        with installed(self, INSTALL):
+            env = import_module("gym_aloha.env").AlohaEnv(self.about.own)
+        self.physics, self._task = env._env.physics, env._env.task
         self.model, self.data = self.physics.model.ptr, self.physics.data.ptr
-        self.actions = _actions(self.model)
-        self.start(0)
-
-    @override
-    def start(self, seed: int) -> None:
-        super().start(seed % 2**32)  # gym_aloha takes no larger seed
-
-    @property
-    @override
-    def progress(self) -> float:
-        """Reward of the state as a share of the environment's highest reward."""
-        return float(self._env._env.task.get_reward(self.physics)) / MOST_REWARD
-
-    def scene(self) -> AlohaScene:
-        """Return the scene read from the state."""
-        return self.task.scene(self.task, self.model, self.data)
-
-    def measured(self) -> F64:
-        """Return joint positions [rad] and gripper openings, 0 to 1, (14,)."""
-        return self._env._env.task.get_qpos(self.physics)
-
-    @override
-    def observed_names(self) -> tuple[str, ...]:
-        found = self.scene().observed().items()
-        return tuple(
-            one
-            for name, value in found
-            for one in (coordinates(name) if np.ndim(value) else (name,))
+        # it would draw three pictures in every step, whatever is observed
+        self._task.get_observation = lambda _: None
+        env._format_raw_obs = lambda _: np.empty(0)
+        env.action_space = gymnasium.spaces.Box(*_bounds(self.model), dtype=np.float64)
+        self._arms = {side: Arm(self.model, number, side) for number, side in enumerate(SIDES)}
+        around = (
+            coordinates(name) if np.ndim(value) else (name,)
+            for name, value in self.scene().observed().items()
         )
+        self.names = {AGENT: NAMES, AROUND: sum(around, ()), "action": NAMES}
+        return env
 
     @override
-    def observe(self) -> Observation:
-        """Return joint positions and gripper openings, (14,), the scene's `environment_state`,
-        (k,), and pictures.
-        """
+    def observe(self, env: Any, seen: F64) -> dict[str, F64]:
+        """Return joint positions and gripper openings, (14,), and the scene's numbers, (k,)."""
         numbers = np.hstack([*self.scene().observed().values()])
-        pictures = self._pictures(self._cameras) if self._cameras else {}
-        return Observation(self.measured().astype(np.float32), numbers.astype(np.float32), pictures)
+        return {AGENT: self.measured(), AROUND: numbers}
 
     @override
-    def set_state(self, state: State) -> None:
-        self._restore(state, mujoco.mj_stateSize(self.model, WHOLE))
-        mujoco.mj_setState(self.model, self.data, state.physics, WHOLE)
-        mujoco.mj_forward(self.model, self.data)
+    def act(self, env: Any, seen: F64) -> Label:
+        found = label(self.scene(), self._arms, self.data.qfrc_bias)
+        if isinstance(found, Label):
+            return found
+        return Label(self.measured(), 0, False, 1.0, found)
 
     @override
-    def positions(self) -> dict[str, F64]:
+    def progress(self, env: Any, info: Mapping[str, Any]) -> float:
+        """Return the reward of the state as a share of the environment's highest reward."""
+        return float(self._task.get_reward(self.physics)) / MOST_REWARD
+
+    @override
+    def positions(self, env: Any) -> dict[str, F64]:
         """Return the positions (3,) [m] of the right hand and the objects, the first of which is
         `object`.
         """
@@ -137,6 +130,57 @@ class AlohaEnv(PackagedEnv):
         return {"hand": scene.right.position} | {name: thing.position for name, thing in things}
 
     @override
+    def render(self, env: Any, camera: str, cameras: CameraConfig) -> NDArray[np.uint8]:
+        painter = _painter(self.task, fine=cameras.height > _COARSE)
+        painter.restore(None, self.state(env))
+        try:
+            return painter.physics.render(cameras.height, cameras.width, camera)
+        except Exception as error:  # what OpenGL and its bindings raise
+            raise RenderError(f"{self.name} cannot be rendered ({error}); {REMEDY}") from error
+
+    @override
+    def state(self, env: Any) -> F64:
+        """Return MuJoCo's integration state, (p,): after a step, all poses are up to date."""
+        return physics_of(self.model, self.data)
+
+    @override
+    def restore(self, env: Any, state: F64) -> None:
+        mujoco.mj_setState(self.model, self.data, state, WHOLE)
+        mujoco.mj_forward(self.model, self.data)
+
+    def scene(self) -> AlohaScene:
+        """Return the scene read from the state."""
+        return self.about(self.model, self.data)
+
+    def measured(self) -> F64:
+        """Return joint positions [rad] and gripper openings, 0 to 1, (14,)."""
+        return self._task.get_qpos(self.physics)
+
+
+class AlohaEnv(GymEnv):
+    """An environment of `gym_aloha` behind the contract, of which new scenes can be made."""
+
+    world: Aloha
+    hashes_code = False
+
+    @override
+    def step(self, action: NDArray[Any]) -> Outcome:
+        return super().step(action)._replace(ended=False)  # `ends_solved`, as the caller asks
+
+    @override
+    def _found_actions(self) -> GymActions:
+        found = super()._found_actions()
+        scale = np.full(len(found), LONGEST)
+        scale[GRIPPERS] = 1.0
+        return AlohaActions(found.names, found.low, found.high, scale, found.relative)
+
+    @override
+    def _described(self, horizon: int) -> EnvironmentSpec:
+        found = super()._described(horizon)
+        can = (*found.can, "redrawn")
+        return replace(found, action_meaning=TWO_ARMS, state_names=(), can=can)
+
+    @override
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
         """Return `state` with some arms and some untouched objects on the table moved at random.
 
@@ -144,112 +188,107 @@ class AlohaEnv(PackagedEnv):
         overlap.
         """
         self.set_state(state)
-        self._env.reset(seed=int(rng.integers(2**32)))
-        fresh = self.data.qpos.copy()
+        model, data = self.world.model, self.world.data
+        self.env.reset(seed=int(rng.integers(2**32)))
+        fresh = data.qpos.copy()
         self.set_state(state)
         if rng.random() < 2 * _DROPPED:
             self._drop(rng)
-        scene = self.scene()
+        scene = self.world.scene()
         holders = {
             name: [side for side in scene.hands if any(scene.touches(side, name))]
-            for name in self.task.objects
+            for name in self.world.about.objects
         }
         for name, sides in holders.items():
             if not sides and scene.on_table(name) and rng.random() < _ANEW:
-                at, speed = self._free(name)
-                self.data.qpos[at : at + 2] = fresh[at : at + 2]
-                self.data.qvel[speed : speed + 6] = 0
+                at, speed = _free(model, name)
+                data.qpos[at : at + 2] = fresh[at : at + 2]
+                data.qvel[speed : speed + 6] = 0
         for number, (side, hand) in enumerate(scene.hands.items()):
             held = [name for name, sides in holders.items() if side in sides]
             if rng.random() < _STAYS or any(
                 len(holders[name]) > 1 or scene.on_table(name) for name in held
             ):
                 continue
-            self.data.qpos[8 * number : 8 * number + 6] += rng.normal(
+            data.qpos[8 * number : 8 * number + 6] += rng.normal(
                 0.0, _ELSEWHERE * rng.uniform() ** 2, 6
             )
-            mujoco.mj_kinematics(self.model, self.data)
-            moved = read_hand(side, number, self.data)
+            mujoco.mj_kinematics(model, data)
+            moved = read_hand(side, number, data)
             turn = moved.rotation @ hand.rotation.T
             for name in held:
-                at, _ = self._free(name)
-                self.data.qpos[at : at + 3] = moved.position + turn @ (
+                at, _ = _free(model, name)
+                data.qpos[at : at + 3] = moved.position + turn @ (
                     scene.things[name].position - hand.position
                 )
                 quat = np.empty(4)
                 mujoco.mju_mat2Quat(quat, (turn @ scene.things[name].axes).ravel())
-                self.data.qpos[at + 3 : at + 7] = quat
-        mujoco.mj_forward(self.model, self.data)
-        if (self.data.contact.dist < -_DEEP).any():
+                data.qpos[at + 3 : at + 7] = quat
+        mujoco.mj_forward(model, data)
+        if (data.contact.dist < -_DEEP).any():
             return None
-        return replace(state, physics=self._physics())
+        return replace(state, physics=physics_of(model, data))
 
     def _drop(self, rng: np.random.Generator) -> None:
         """Pick a hand.
 
         If it holds something in the air, open it and simulate some control steps.
         """
-        scene, number = self.scene(), int(rng.integers(2))
+        scene, number = self.world.scene(), int(rng.integers(2))
         hand = list(scene.hands)[number]
         if any(
             all(scene.touches(hand, name)) and not scene.on_table(name)
-            for name in self.task.objects
+            for name in self.world.about.objects
         ):
-            action = self.measured()
+            action = self.world.measured()
             action[GRIPPERS[number]] = 1.0
             for _ in range(rng.integers(1, _FALL)):
                 self.step(action)
 
-    def _free(self, name: str) -> tuple[int, int]:
-        """Addresses of an object's pose in `qpos` and of its velocity in `qvel`."""
-        joint = self.model.body(name).jntadr[0]
-        return int(self.model.jnt_qposadr[joint]), int(self.model.jnt_dofadr[joint])
 
-    def _pictures(self, cameras: CameraConfig) -> dict[str, NDArray[np.uint8]]:
-        height, width = cameras.size
-        painter = _painter(self.task.name, fine=height > _COARSE)
-        painter.set_state(self.get_state())
-        try:
-            return {
-                name: painter.draw(height=height, width=width, camera_id=name)
-                for name in cameras.names
-            }
-        except Exception as error:  # what OpenGL and its bindings raise
-            raise RenderError(f"{self.robot} cannot be rendered ({error}); {REMEDY}") from error
+class AlohaKind(GymKind):
+    """The tasks of `gym_aloha`, which LeRobot's evaluator also runs."""
+
+    @override
+    def drawing_version(self, config: EnvConfig) -> int:
+        return DRAWN
+
+    @override
+    def lerobot_words(self, robot: str, task: str) -> list[str]:
+        return ["--env.type=aloha", f"--env.task={task}", "--eval.batch_size=1"]
+
+
+WORLD = AlohaKind(Aloha, AlohaEnv)
+
+
+def _free(model: mujoco.MjModel, name: str) -> tuple[int, int]:
+    """Addresses of an object's pose in `qpos` and of its velocity in `qvel`."""
+    joint = model.body(name).jntadr[0]
+    return int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
 
 
 @cached_per_thread()
-def _painter(task: str, *, fine: bool) -> AlohaEnv:
-    """The environment that draws a task's states in this thread, so that one OpenGL context is
+def _painter(task: str, *, fine: bool) -> Aloha:
+    """The world that draws a task's states in this thread, so that one OpenGL context is
     enough.
 
     Unless `fine`, its meshes have fewer faces and its shadows are coarser, which is 3.5 times
     faster in software.
     """
-    painter = AlohaEnv(task)
+    painter = Aloha(task)
+    painter.make()
     if not fine:
         simplify_meshes(painter.model, _CELL)
         painter.model.vis.quality.shadowsize = _SHADOWS
     return painter
 
 
-def _gym_aloha() -> Any:
-    try:
-        return import_module("gym_aloha.env")
-    except ModuleNotFoundError as error:
-        raise ManipError(
-            f"{AlohaEnv.robot} needs {error.name}, which is not installed: {INSTALL}"
-        ) from error
-
-
-def _actions(model: mujoco.MjModel) -> ActionSpace:
-    """Actions within the actuators' own bounds, which MuJoCo enforces.
+def _bounds(model: mujoco.MjModel) -> tuple[F64, F64]:
+    """Return the actuators' own bounds, which MuJoCo enforces, (14,) each.
 
     The environment's -1 to 1 does not apply.
     """
-    chosen = [*range(7), *range(8, 15)]  # a hand's right finger mirrors the left one
-    low, high = model.actuator_ctrlrange[chosen].T.copy()
+    # a hand's right finger mirrors the left one
+    low, high = model.actuator_ctrlrange[[*range(7), *range(8, 15)]].T.copy()
     low[GRIPPERS], high[GRIPPERS] = 0.0, 1.0
-    is_joint = np.ones(len(chosen), bool)
-    is_joint[GRIPPERS] = False
-    return AlohaActions(ALOHA_NAMES, low, high, np.where(is_joint, LONGEST, 1.0), is_joint)
+    return low, high

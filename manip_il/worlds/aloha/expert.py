@@ -1,19 +1,19 @@
 """The expert of two arms: one label for both hands, a function of the state alone."""
 
+from __future__ import annotations
+
 import math
+from collections.abc import Mapping
 from importlib import import_module
-from typing import override
 
 import mujoco
 import numpy as np
 
-from manip_il.mdp import F64, Label, State
+from manip_il.caching import cached_per_thread
+from manip_il.mdp import F64, Label
 from manip_il.robots.geometry import turned_towards
 from manip_il.robots.ik import PoseProgram
-from manip_il.worlds.aloha.environment import AlohaEnv
-from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, Hand, HandTarget
-from manip_il.worlds.contract import Environment, Expert
-from manip_il.worlds.packaged import Packaged
+from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, Hand, HandTarget, phases
 
 ORIENTATION, POSTURE = 0.3, 0.003  # costs [1/rad], relative to 1 [1/m] for the position
 # forearm roll's cost at a straight wrist; peak's width, wrist up and down [rad]
@@ -26,63 +26,55 @@ CREEPS = 0.95  # share of the breakaway lead below which a joint creeps
 BREAKAWAY = 1.5  # step of a joint per lead beyond it
 
 
-class AlohaExpert(Expert):
-    """Labels any state of one task."""
+def label(scene: AlohaScene, arms: Mapping[str, Arm], bias: F64) -> Label | str:
+    """Return the label of one state, or why there is no sound action.
 
-    def __init__(self, task: str):
-        self._env = AlohaEnv(task)
-        self._pairs = {pair: number for number, pair in enumerate(self._env.task.phases)}
-        self._arms = {side: _Arm(self._env, number, side) for number, side in enumerate(SIDES)}
-
-    @override
-    def label(self, state: State, environment: Environment | None = None) -> Label:
-        env = self._env
-        env.set_state(state)
-        scene = env.scene()
-        if reason := self._unsound(scene):
-            return self._still(reason)
-        rungs = {
-            side: next(rung for rung in env.task.rungs[side] if rung.holds(scene)) for side in SIDES
-        }
-        action = np.empty(len(env.actions))
-        for number, (side, rung) in enumerate(rungs.items()):
-            target = rung.target(scene)
-            command = self._arms[side].command(scene.hands[side], target)
-            if command is None:
-                return self._still(f"inverse kinematics of the {side} arm has no solution")
-            action[7 * number : 7 * number + 7] = *command, target.gripper
-        phase = self._pairs[", ".join(rung.name for rung in rungs.values())]
-        return Label(np.clip(action, env.actions.low, env.actions.high), phase, True, 0.0)
-
-    def _unsound(self, scene: AlohaScene) -> str:
-        if scene.arms_touch:
-            return "the arms touch"
-        for name, side in scene.task.grasped.items():
-            position = scene.things[name].position
-            if position[2] < FALLEN:
-                return f"{name} off the table"
-            near, far = REACH
-            if not near < math.dist(position[:2], self._arms[side].foot) < far:
-                return f"{name} out of the {side} arm's reach"
-        return ""
-
-    def _still(self, reason: str) -> Label:
-        actions = self._env.actions
-        return Label(
-            np.clip(self._env.measured(), actions.low, actions.high), 0, False, 1.0, reason
-        )
+    Args:
+        scene: The state.
+        arms: Side -> its arm.
+        bias: Forces of gravity and motion on all joints of the model, (nv,).
+    """
+    if reason := _unsound(scene, arms):
+        return reason
+    action, names = list[float](), list[str]()
+    for side, arm in arms.items():
+        rung = next(rung for rung in scene.rungs[side] if rung.holds(scene))
+        target = rung.target(scene)
+        command = arm.command(scene.hands[side], target, bias)
+        if command is None:
+            return f"inverse kinematics of the {side} arm has no solution"
+        action += [*command, target.gripper]
+        names.append(rung.name)
+    return Label(np.array(action), phases(type(scene)).index(", ".join(names)), True, 0.0)
 
 
-class _Arm:
-    """One arm: converts a target of its hand to targets of its joints, (6,) [rad]."""
+def _unsound(scene: AlohaScene, arms: Mapping[str, Arm]) -> str:
+    if scene.arms_touch:
+        return "the arms touch"
+    for name, side in scene.grasped.items():
+        position = scene.things[name].position
+        if position[2] < FALLEN:
+            return f"{name} off the table"
+        near, far = REACH
+        if not near < math.dist(position[:2], arms[side].foot) < far:
+            return f"{name} out of the {side} arm's reach"
+    return ""
 
-    def __init__(self, env: AlohaEnv, number: int, side: str):
-        model, self._data = env.model, env.data
+
+class Arm:
+    """One arm: converts a target of its hand to targets of its joints, (6,) [rad].
+
+    Args:
+        model: The environment's model.
+        number: 0 for the left arm, 1 for the right one.
+        side: The same by name.
+    """
+
+    def __init__(self, model: mujoco.MjModel, number: int, side: str):
+        self.side = side
         self._joints = joints = np.arange(8 * number, 8 * number + 6)
         self.foot = model.body(f"vx300s_{side}").pos[:2].tolist()
         constants = import_module("gym_aloha.constants")
-        home = np.array(constants.START_ARM_POSE[:6])
-        self._ik = PoseProgram(_alone(side), f"cali_{side}_site1", home, (ORIENTATION, POSTURE))
         self._gain = model.actuator_gainprm[joints, 0]
         # lead at which a joint overcomes friction [rad]
         self._breakaway = model.dof_frictionloss[joints] / self._gain
@@ -98,22 +90,29 @@ class _Arm:
         )
         self._creep = 1 - np.exp(-softness)  # step per lead [rad/rad]
 
-    def command(self, hand: Hand, target: HandTarget) -> F64 | None:
+    def command(self, hand: Hand, target: HandTarget, bias: F64) -> F64 | None:
         """Return joint targets (6,) [rad] one step towards a target.
 
-        None if there is no solution.
+        Args:
+            hand: The arm's hand.
+            target: Where it should go.
+            bias: Forces of gravity and motion on all joints of the model, (nv,).
+
+        Returns:
+            The targets; None if there is no solution.
         """
+        ik = _program(self.side)
         way = target.position - hand.position
         length = float(np.linalg.norm(way))
         position = hand.position + way * min(1.0, MOST_STEP / max(length, MOST_STEP))
-        self._ik.data.qpos[:] = hand.q
-        self._ik.update()
-        self._ik.posture.set_cost(_posture_costs(hand.q))
-        step = self._ik.solve(position, turned_towards(hand.rotation, target.rotation, MOST_TURN))
+        ik.data.qpos[:] = hand.q
+        ik.update()
+        ik.posture.set_cost(_posture_costs(hand.q))
+        step = ik.solve(position, turned_towards(hand.rotation, target.rotation, MOST_TURN))
         if step is None:
             return None
         step *= min(1.0, target.longest / max(float(np.abs(step).max()), target.longest))
-        gravity = self._data.qfrc_bias[self._joints] / self._gain
+        gravity = bias[self._joints] / self._gain
         return hand.q + self._lead(step) + gravity
 
     def _lead(self, step: F64) -> F64:
@@ -137,6 +136,13 @@ def _posture_costs(q: F64) -> F64:
     return costs
 
 
+@cached_per_thread()
+def _program(side: str) -> PoseProgram:
+    """Inverse kinematics of an arm, which all environments of a thread share."""
+    home = np.array(import_module("gym_aloha.constants").START_ARM_POSE[:6])
+    return PoseProgram(_alone(side), f"cali_{side}_site1", home, (ORIENTATION, POSTURE))
+
+
 def _alone(side: str) -> mujoco.MjModel:
     """One arm's model, with nothing else and without fingers."""
     assets = import_module("gym_aloha.constants").ASSETS_DIR
@@ -149,12 +155,3 @@ def _alone(side: str) -> mujoco.MjModel:
     for geom in list(spec.geoms):
         spec.delete(geom)
     return spec.compile()
-
-
-class _Aloha(Packaged):
-    @override
-    def lerobot_words(self, robot: str, task: str) -> list[str]:
-        return ["--env.type=aloha", f"--env.task={task}", "--eval.batch_size=1"]
-
-
-WORLD = _Aloha(AlohaEnv, AlohaExpert)

@@ -5,6 +5,7 @@ They meet in the air, and the peg goes in.
 
 import math
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from manip_il.worlds.aloha.ladder import (
     ARM,
     PITCH,
     AlohaScene,
-    AlohaTask,
+    HandRung,
     HandTarget,
     Held,
     Thing,
@@ -24,7 +25,6 @@ from manip_il.worlds.aloha.ladder import (
     pitched,
     take_rungs,
 )
-from manip_il.worlds.packaged import PackagedRung
 
 PEG, SOCKET = "peg", "socket"
 OF = {"left": SOCKET, "right": PEG}
@@ -44,6 +44,13 @@ CARRIED = 0.04  # longest step of a joint while an object is carried [rad]
 
 class Insertion(AlohaScene):
     """One state of the peg-insertion task."""
+
+    name = "AlohaInsertion-v0"
+    instruction = "Insert the peg into the socket."
+    own = "insertion"
+    objects: ClassVar = {PEG: Held(0.018, 0.0075, long=True), SOCKET: Held(0.026, 0.019, long=True)}
+    grasped: ClassVar = {PEG: "right", SOCKET: "left"}
+    inserted = (PEG, SOCKET)
 
     @cached_property
     def has(self) -> dict[str, bool]:
@@ -90,12 +97,12 @@ def _lifted_to(thing: Thing, to: F64) -> F64:
     return np.array([thing.position[0] + way[0], thing.position[1] + way[1], to[2]])
 
 
-def _carry(side: str, to: F64) -> PackagedRung:
+def _carry(side: str, to: F64) -> HandRung:
     def target(scene: Insertion) -> HandTarget:
         place = _lifted_to(scene.things[OF[side]], to)
         return move_object(scene, side, OF[side], place, np.eye(3), CARRIED)
 
-    return PackagedRung("carry", lambda scene: scene.has[side], target)
+    return HandRung("carry", lambda scene: scene.has[side], target)
 
 
 def _insert(scene: Insertion) -> HandTarget:
@@ -106,24 +113,14 @@ def _insert(scene: Insertion) -> HandTarget:
     )
 
 
-_RUNGS = {
+Insertion.rungs = {
     "left": (_carry("left", MEETING), *take_rungs("left", SOCKET, lambda one: one.grasps["left"])),
     "right": (
-        PackagedRung(
+        HandRung(
             "insert", lambda one: one.has["right"] and one.ready and one.depth < BEFORE, _insert
         ),
-        PackagedRung("align", lambda one: one.has["right"] and one.ready, _insert),
+        HandRung("align", lambda one: one.has["right"] and one.ready, _insert),
         _carry("right", MEETING + WAITING),
         *take_rungs("right", PEG, lambda one: one.grasps["right"]),
     ),
 }
-TASK = AlohaTask(
-    "AlohaInsertion-v0",
-    "Insert the peg into the socket.",
-    "insertion",
-    {PEG: Held(0.018, 0.0075, long=True), SOCKET: Held(0.026, 0.019, long=True)},
-    {PEG: "right", SOCKET: "left"},
-    Insertion,
-    _RUNGS,
-    (PEG, SOCKET),
-)

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, NamedTuple
+from functools import cache, cached_property
+from typing import Any, ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.robots.geometry import angle_between, turned_towards
-from manip_il.worlds.packaged import PackagedRung, always
 
 SIDES = ("left", "right")
 FINGER_AT_TOUCH = 0.0224  # position of a finger joint at which the fingers would touch [m]
@@ -106,9 +105,33 @@ class Thing:
         return np.stack([ahead, cross(up, ahead), up], axis=1)
 
 
-@dataclass(frozen=True)
-class AlohaTask:
-    """One task of `gym_aloha`.
+class HandRung(NamedTuple):
+    """A phase of one hand.
+
+    Attributes:
+        name: Name of the phase.
+        holds: Returns whether the rung holds in a scene.
+        target: Returns the hand's `HandTarget` in a scene.
+    """
+
+    name: str
+    holds: Callable[[Any], bool]
+    target: Callable[[Any], HandTarget]
+
+
+def always(scene: AlohaScene) -> bool:
+    """Return True: the rung holds in every state."""
+    return True
+
+
+class AlohaScene:
+    """Hands, objects and contacts in one state of a task of `gym_aloha`.
+
+    A task is a subclass, which gives the attributes, and properties that its rungs need.
+
+    Args:
+        model: The environment's model.
+        data: The environment's data, with poses and contacts of the state.
 
     Attributes:
         name: Name of the task.
@@ -116,7 +139,6 @@ class AlohaTask:
         own: Its name in `gym_aloha`.
         objects: Object -> how it is held.
         grasped: Object -> the hand that takes it.
-        scene: Facts that the rungs read.
         rungs: Hand -> its rungs, the latest first.
         inserted: An object, and the object that it goes into; empty if nothing is inserted.
     """
@@ -124,37 +146,18 @@ class AlohaTask:
     name: str
     instruction: str
     own: str
-    objects: Mapping[str, Held]
-    grasped: Mapping[str, str]
-    scene: type[AlohaScene]
-    rungs: Mapping[str, tuple[PackagedRung, ...]]
+    objects: ClassVar[Mapping[str, Held]]
+    grasped: ClassVar[Mapping[str, str]]
+    rungs: Mapping[str, tuple[HandRung, ...]]
     inserted: tuple[str, ...] = ()
 
-    @property
-    def phases(self) -> tuple[str, ...]:
-        """`none`, then `LEFT, RIGHT` for every pair of the two hands' rungs, earliest first."""
-        left, right = (self.rungs[side][::-1] for side in SIDES)
-        return ("none", *(f"{one.name}, {other.name}" for one in left for other in right))
-
-
-class AlohaScene:
-    """Hands, objects and contacts in one state.
-
-    A task's own subclass adds the facts that its rungs need.
-
-    Args:
-        task: The task, which names the objects.
-        model: The environment's model.
-        data: The environment's data, with poses and contacts of the state.
-    """
-
-    def __init__(self, task: AlohaTask, model: mujoco.MjModel, data: mujoco.MjData):
-        self.task, self._model = task, model
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        self._model = model
         self.hands = {side: read_hand(side, number, data) for number, side in enumerate(SIDES)}
         self.left, self.right = self.hands.values()
-        bodies = {name: data.body(name) for name in task.objects}
+        bodies = {name: data.body(name) for name in self.objects}
         self.things = {
-            name: Thing(body.xpos.copy(), body.xmat.reshape(3, 3).copy(), task.objects[name])
+            name: Thing(body.xpos.copy(), body.xmat.reshape(3, 3).copy(), self.objects[name])
             for name, body in bodies.items()
         }
         self._touching = model.geom_bodyid[data.contact.geom]  # (c, 2)
@@ -220,8 +223,8 @@ class AlohaScene:
                 found[f"{name}_from_{side}"] = hand.sees(thing.position)
                 touched = zip(SIDES, self.touches(side, name), strict=True)
                 found |= {f"{name}_touched.{side}.{finger}": touches for finger, touches in touched}
-        if self.task.inserted:
-            one, other = self.task.inserted
+        if self.inserted:
+            one, other = self.inserted
             inner, outer = self.things[one], self.things[other]
             found[f"{one}_from_{other}"] = outer.frame.T @ (inner.position - outer.position)
             found[f"{one}_ahead_in_{other}"] = outer.frame.T @ inner.frame[:, 0]
@@ -230,6 +233,13 @@ class AlohaScene:
     def _meet(self, one: str, other: str) -> bool:
         pair = {self._model.body(one).id, self._model.body(other).id}
         return any(pair == {*bodies} for bodies in self._touching.tolist())
+
+
+@cache
+def phases(task: type[AlohaScene]) -> tuple[str, ...]:
+    """Return `none`, then `LEFT, RIGHT` for every pair of the two hands' rungs, earliest first."""
+    left, right = (task.rungs[side][::-1] for side in SIDES)
+    return ("none", *(f"{one.name}, {other.name}" for one in left for other in right))
 
 
 def cross(a: F64, b: F64) -> F64:
@@ -336,9 +346,7 @@ def approach(
     return HandTarget(hand.position + way, rotation, OPEN, longest)
 
 
-def take_rungs(
-    side: str, name: str, grasp: Callable[[Any], F64]
-) -> tuple[PackagedRung, PackagedRung]:
+def take_rungs(side: str, name: str, grasp: Callable[[Any], F64]) -> tuple[HandRung, HandRung]:
     """Return the rungs of a hand that takes an object from the table, the latest first.
 
     Args:
@@ -347,12 +355,12 @@ def take_rungs(
         grasp: Returns the rotation of the grasp in a scene, (3, 3).
     """
     return (
-        PackagedRung(
+        HandRung(
             "grasp",
             lambda one: one.is_at_grasp(side, name, grasp(one)),
             lambda one: close_on(one, name, grasp(one)),
         ),
-        PackagedRung("approach", always, lambda one: approach(one, side, name, grasp(one))),
+        HandRung("approach", always, lambda one: approach(one, side, name, grasp(one))),
     )
 
 

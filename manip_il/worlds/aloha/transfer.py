@@ -1,6 +1,7 @@
 """The right hand takes the cube from the table and hands it to the left one, in the air."""
 
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,19 +13,19 @@ from manip_il.worlds.aloha.ladder import (
     OPEN,
     PITCH,
     AlohaScene,
-    AlohaTask,
+    HandRung,
     HandTarget,
     Held,
     X,
     Z,
     ahead_across,
+    always,
     approach,
     close_on,
     nearest,
     pitched,
     take_rungs,
 )
-from manip_il.worlds.packaged import PackagedRung, always
 
 CUBE = "box"
 MEETING = np.array([0.0, 0.5, 0.25])  # position of the cube for the handover [m]
@@ -44,6 +45,12 @@ PARTING = 0.03
 
 class Transfer(AlohaScene):
     """One state of the cube-transfer task."""
+
+    name = "AlohaTransferCube-v0"
+    instruction = "Pick up the cube with the right arm and transfer it to the left arm."
+    own = "transfer_cube"
+    objects: ClassVar = {CUBE: Held(0.027, 0.017)}
+    grasped: ClassVar = {CUBE: "right"}
 
     @cached_property
     def cube(self) -> F64:
@@ -116,35 +123,24 @@ def _wait(scene: Transfer) -> HandTarget:
     return HandTarget(MEETING + WAITING, ahead_across(X, Z), OPEN, FAST)
 
 
-_RUNGS = {
+Transfer.rungs = {
     "left": (
-        PackagedRung(
+        HandRung(
             "hold",
             lambda one: one.left_holds,
             lambda one: HandTarget(one.left.position, one.left.rotation, CLOSED),
         ),
-        PackagedRung(
+        HandRung(
             "close",
             lambda one: one.lifted and one.is_at_grasp("left", CUBE, one.left_grasp),
             lambda one: close_on(one, CUBE, one.left_grasp, CARRIED),
         ),
-        PackagedRung(
-            "come", lambda one: one.right_holds and one.lifted and one.to_go < NEAR, _come
-        ),
-        PackagedRung("wait", always, _wait),
+        HandRung("come", lambda one: one.right_holds and one.lifted and one.to_go < NEAR, _come),
+        HandRung("wait", always, _wait),
     ),
     "right": (
-        PackagedRung("release", lambda one: one.left_holds and one.left.gap < LEFT_CLOSED, _let_go),
-        PackagedRung("carry", lambda one: one.right_holds, _carry),
+        HandRung("release", lambda one: one.left_holds and one.left.gap < LEFT_CLOSED, _let_go),
+        HandRung("carry", lambda one: one.right_holds, _carry),
         *take_rungs("right", CUBE, lambda one: one.right_grasp),
     ),
 }
-TASK = AlohaTask(
-    "AlohaTransferCube-v0",
-    "Pick up the cube with the right arm and transfer it to the left arm.",
-    "transfer_cube",
-    {CUBE: Held(0.027, 0.017)},
-    {CUBE: "right"},
-    Transfer,
-    _RUNGS,
-)

@@ -1,200 +1,167 @@
-"""One Fetch environment of gymnasium-robotics, unmodified, behind the contract of a world."""
+"""Fetch's environments of gymnasium-robotics, unmodified, as a world."""
 
 import contextlib
 import io
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from importlib import import_module
-from typing import Any, ClassVar, override
+from typing import Any, override
 
 import gymnasium
 import mujoco
 import numpy as np
+from gymnasium.wrappers import TransformObservation
 from numpy.typing import NDArray
 
-from manip_il.mdp import F64, Observation, State
-from manip_il.robots.action_space import ActionSpace
-from manip_il.sim.config import CameraConfig
-from manip_il.worlds.contract import Outcome
-from manip_il.worlds.packaged import TOLERANCE, WHOLE, PackagedEnv, coordinates
+from manip_il.mdp import F64, Label, State
+from manip_il.worlds.contract import EnvironmentSpec
+from manip_il.worlds.fetch.expert import LADDERS, REACH, scene_of
+from manip_il.worlds.gym.environment import GymActions, GymEnv, GymKind, coordinates
+from manip_il.worlds.gym.restoring import WHOLE, physics_of
+from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 
-STATE_NAMES = ("gripper.x", "gripper.y", "gripper.z", "gripper.opening")
-
-
-@dataclass(frozen=True)
-class FetchTask:
-    """A task of Fetch.
-
-    Attributes:
-        name: Name of the environment in gymnasium-robotics.
-        instruction: The task in words, for policies that read them.
-        has_object: Whether the goal is for a cube, and not for the gripper.
-        blocked: Whether the fingers stay closed.
-        phases: Names of the phases of all tasks.
-    """
-
-    name: str
-    instruction: str
-    has_object: bool = True
-    blocked: bool = True
-    phases: ClassVar[tuple[str, ...]] = ("none", "approach", "grasp", "carry", "push", "hold")
+NAMES = ("gripper.x", "gripper.y", "gripper.z", "gripper.opening")
+TOLERANCE = 0.05  # [m]
+INSTRUCTIONS = {
+    "FetchReach-v4": "Move the gripper to the goal",
+    "FetchPush-v4": "Push the cube to the goal",
+    "FetchPickAndPlace-v4": "Bring the cube to the goal",
+}
 
 
-_TASKS = (
-    FetchTask("FetchReach-v4", "Move the gripper to the goal", has_object=False),
-    FetchTask("FetchPush-v4", "Push the cube to the goal"),
-    FetchTask("FetchPickAndPlace-v4", "Bring the cube to the goal", blocked=False),
-)
-FETCH_TASKS = {task.name: task for task in _TASKS}
+class Fetch(GymWorld):
+    """A Fetch environment; what its `step` and `reset` return is the goal, (3,) [m]."""
 
+    name = "fetch_stock"
+    tasks = tuple(INSTRUCTIONS)
+    fps = 25
+    horizon = 50
+    phases = ("none", "approach", "grasp", "carry", "push", "hold")
+    cameras = ()
 
-class FetchActions(ActionSpace):
-    """Actions [dx, dy, dz, fingers], each in [-1, 1] in every state."""
-
-    def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
-        """Draw any action, (4,), whatever the state (4,) is."""
-        return rng.uniform(self.low, self.high)
-
-
-_ONES = np.ones(len(STATE_NAMES))
-ACTIONS = FetchActions(
-    STATE_NAMES, -_ONES, _ONES, np.array([1.0, 1.0, 1.0, 2.0]), np.array([True, True, True, False])
-)
-
-
-class FetchEnv(PackagedEnv):
-    """An environment of gymnasium-robotics.
-
-    Args:
-        task: The environment's name there.
-        cameras: Not used, as no camera draws these environments.
-    """
-
-    robot = "fetch_stock"
-    action_meaning = (
-        "displacement of the gripper in x, y, z [5 cm], fingers from -1 (close) to 1 (open)"
-    )
-    control_hz, horizon = 25, 50
-    actions = ACTIONS
-
-    def __init__(self, task: str, cameras: CameraConfig | None = None):
-        self.task = FETCH_TASKS[task]
+    @override
+    def make(self) -> Any:
         # gymnasium-robotics announces its versions there
         with contextlib.redirect_stderr(io.StringIO()):
             import_module("gymnasium_robotics")  # which registers its names
             # the horizon is its time limit
-            self._env: Any = gymnasium.make(task, reward_type="sparse").unwrapped
-        self.model = self._env.model
-        self.data = self._env.data
-        self._env._mujoco_step = self._run_physics
-        self.start(0)
+            env: Any = gymnasium.make(self.task, reward_type="sparse").unwrapped
+        env._mujoco_step = partial(self._run_physics, env)
+        env.action_space = gymnasium.spaces.Box(-1, 1, (len(NAMES),), np.float64)
+        self.instruction = INSTRUCTIONS[self.task]
+        self.names = {AGENT: NAMES, AROUND: _observed_names(env.has_object), "action": NAMES}
+        return TransformObservation(env, lambda _: env.goal, None)
 
     @override
-    def observed_names(self) -> tuple[str, ...]:
-        things = ("object", "object_offset") if self.task.has_object else ()
-        turning = ("object_turn", "object_velocity", "object_spin") if self.task.has_object else ()
-        fingers = ("finger.right", "finger.left")
-        speeds = [f"{name}.velocity" for name in fingers]
-        names = (
-            *coordinates("ee", *things),
-            *fingers,
-            *coordinates(*turning, "ee_velocity"),
-            *speeds,
-        )
-        return (*names, *coordinates("goal"))
+    def reset(self, env: Any, seed: int) -> tuple[F64, Mapping[str, Any]]:
+        found = super().reset(env, seed)
+        self._posed = _motion(env.unwrapped.data)
+        return found
 
     @override
-    def start(self, seed: int) -> None:
-        super().start(seed)
-        self._remember()
-
-    @override
-    def step(self, action: NDArray[Any]) -> Outcome:
-        outcome = super().step(action)
-        # with closed fingers, the environment's step has recomputed all poses
-        if self.task.blocked:
-            self._remember()
-        return outcome
-
-    @property
-    @override
-    def progress(self) -> float:
-        """Share of the task that is done: 1 within the tolerance, 0.5 at twice that distance."""
-        left = np.linalg.norm(
-            self.positions()["object" if self.task.has_object else "hand"] - self.goal
-        )
-        return TOLERANCE / max(TOLERANCE, float(left))
-
-    @property
-    def gripper(self) -> F64:
-        """Position between the fingers, (3,) [m]."""
-        return self.data.site("robot0:grip").xpos
-
-    @property
-    def object(self) -> F64:
-        """Position of the cube, (3,) [m]."""
-        return self.data.site("object0").xpos
-
-    @property
-    def object_velocity(self) -> F64:
-        """Velocity of the cube, (3,) [m/s]."""
-        return self._env._utils.get_site_xvelp(self.model, self.data, "object0")
-
-    @property
-    def opening(self) -> float:
-        """Distance between the fingers [m]."""
-        return sum(
-            float(self.data.joint(f"robot0:{side}_gripper_finger_joint").qpos[0]) for side in "rl"
-        )
-
-    @property
-    def goal(self) -> F64:
-        """Desired goal, (3,) [m]."""
-        return self._env.goal
-
-    @override
-    def observe(self) -> Observation:
+    def observe(self, env: Any, seen: F64) -> dict[str, F64]:
         """Return the gripper's position and opening, (4,) [m], and the environment's own
         observation and goal, (k,).
         """
-        own = self._env._get_obs()
-        state = np.append(own["observation"][:3], self.opening).astype(np.float32)
-        return Observation(
-            state, np.append(own["observation"], own["desired_goal"]).astype(np.float32)
-        )
+        own = env.unwrapped._get_obs()["observation"]
+        return {
+            AGENT: np.append(own[:3], scene_of(env).opening),
+            AROUND: np.append(own, env.unwrapped.goal),
+        }
 
     @override
-    def get_state(self) -> State:
-        """Return MuJoCo's state, what the poses are computed from, and the goal as `variation`."""
-        state = super().get_state()
-        return replace(
-            state, physics=np.concatenate([state.physics, self._posed]), variation=self.goal.copy()
-        )
+    def act(self, env: Any, seen: F64) -> Label:
+        phase, way, fingers = LADDERS[self.task](scene_of(env))
+        action = np.append(np.clip(way / REACH, -1, 1), fingers)
+        return Label(action, self.phases.index(phase), True, 0.0)
+
+    @override
+    def progress(self, env: Any, info: Mapping[str, Any]) -> float:
+        """Return the share of the task that is done: 1 within the tolerance, 0.5 at twice that
+        distance.
+        """
+        scene = scene_of(env)
+        left = np.linalg.norm(scene.object - scene.goal)
+        return TOLERANCE / max(TOLERANCE, float(left))
+
+    @override
+    def positions(self, env: Any) -> dict[str, F64]:
+        scene = scene_of(env)
+        things = {"object": scene.object} if env.unwrapped.has_object else {}
+        return {"hand": scene.gripper} | things
+
+    @override
+    def state(self, env: Any) -> F64:
+        """Return MuJoCo's state, and the positions and velocities that poses follow from, (p,)."""
+        inner = env.unwrapped
+        # with closed fingers, the environment's step ends with computing all poses
+        posed = _motion(inner.data) if inner.block_gripper else self._posed
+        return np.concatenate([physics_of(inner.model, inner.data), posed])
+
+    @override
+    def restore(self, env: Any, state: F64) -> None:
+        model, data = env.unwrapped.model, env.unwrapped.data
+        size = mujoco.mj_stateSize(model, WHOLE)
+        physics, self._posed = state[:size], state[size:]
+        mujoco.mj_setState(model, data, physics, WHOLE)
+        data.qpos[:], data.qvel[:] = self._posed[: model.nq], self._posed[model.nq :]
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_setState(model, data, physics, WHOLE)
+
+    def _run_physics(self, env: Any, action: NDArray[Any]) -> None:
+        """Run the environment's physics steps in two calls, to store the positions and velocities
+        before the last one.
+        """
+        mujoco.mj_step(env.model, env.data, nstep=env.n_substeps - 1)
+        self._posed = _motion(env.data)
+        mujoco.mj_step(env.model, env.data, nstep=1)
+
+
+class FetchEnv(GymEnv):
+    """An environment of Fetch behind the contract."""
+
+    most_seed = 2**64
+    hashes_code = False
 
     @override
     def set_state(self, state: State) -> None:
-        size, nq = mujoco.mj_stateSize(self.model, WHOLE), self.model.nq
-        self._restore(state, size + len(self._posed))
-        physics, self._posed = state.physics[:size].copy(), state.physics[size:].copy()
-        mujoco.mj_setState(self.model, self.data, physics, WHOLE)
-        self.data.qpos[:] = self._posed[:nq]
-        self.data.qvel[:] = self._posed[nq:]
-        mujoco.mj_fwdPosition(self.model, self.data)
-        mujoco.mj_fwdVelocity(self.model, self.data)
-        mujoco.mj_setState(self.model, self.data, physics, WHOLE)
-        self._env.goal = state.variation.copy()
+        super().set_state(state)
+        env: Any = self.env.unwrapped
+        env.goal = state.variation.copy()
 
     @override
-    def positions(self) -> dict[str, F64]:
-        return {"hand": self.gripper} | ({"object": self.object} if self.task.has_object else {})
+    def _found_actions(self) -> GymActions:
+        return replace(super()._found_actions(), scale=np.array([1.0, 1.0, 1.0, 2.0]))
 
-    def _remember(self) -> None:
-        """Store the positions and velocities that the poses are computed from."""
-        self._posed = np.concatenate([self.data.qpos, self.data.qvel])
+    @override
+    def _described(self, horizon: int) -> EnvironmentSpec:
+        return replace(
+            super()._described(horizon),
+            action_meaning="displacement of the gripper in x, y, z [5 cm], fingers from -1 (close)"
+            " to 1 (open)",
+            state_names=(),
+            ends_solved=False,
+        )
 
-    def _run_physics(self, action: NDArray[Any]) -> None:
-        """Run the environment's physics steps in two calls, to store the state before the last
-        one.
-        """
-        mujoco.mj_step(self.model, self.data, nstep=self._env.n_substeps - 1)
-        self._remember()
-        mujoco.mj_step(self.model, self.data, nstep=1)
+
+WORLD = GymKind(Fetch, FetchEnv)
+
+
+def _motion(data: mujoco.MjData) -> F64:
+    """Return positions and velocities of all joints."""
+    return np.concatenate([data.qpos, data.qvel])
+
+
+def _observed_names(has_object: bool) -> tuple[str, ...]:
+    """Return the names of the entries of `environment_state`, (k,)."""
+    fingers = ("finger.right", "finger.left")
+    names = (
+        *coordinates("ee", "object", "object_offset"),
+        *fingers,
+        *coordinates("object_turn", "object_velocity", "object_spin", "ee_velocity"),
+        *(f"{name}.velocity" for name in fingers),
+        *coordinates("goal"),
+    )
+    return tuple(name for name in names if has_object or not name.startswith("object"))

@@ -1,19 +1,17 @@
 """Experts of Fetch: ladders over gripper, cube and goal, the task's last rung first.
 
-A rung reads the environment. Its target is the gripper's displacement, (3,) [m], and the fingers'
-command, -1 to 1. An action of 1 moves the gripper by about `REACH` in a control step along each
-axis independently, so that the longest of x, y and z determines how long a move takes.
+A ladder reads the state from a `FetchScene`, and returns the name of the first rung that holds and
+its target: the gripper's displacement, (3,) [m], and the fingers' command, -1 to 1. An action of 1
+moves the gripper by about `REACH` in a control step along each axis independently, so that the
+longest of x, y and z determines how long a move takes.
 """
 
 import itertools
-from typing import override
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from manip_il.mdp import F64, Label, State
-from manip_il.worlds.contract import Environment, Expert
-from manip_il.worlds.fetch.environment import FetchEnv
-from manip_il.worlds.packaged import Packaged, PackagedRung, always
+from manip_il.mdp import F64
 
 REACH = 0.032  # displacement of the gripper in one control step at an action of 1 [m]
 OPEN, CLOSE = 1.0, -1.0
@@ -55,52 +53,85 @@ DOWN = 0.5  # share of a step after which a gripper that descends past the cube 
 LEG = 0.005  # cost of every leg of a path around the cube, added to its length [m]
 
 
-def _to_cube(env: FetchEnv) -> F64:
+class FetchScene(NamedTuple):
+    """What the ladders read from a state.
+
+    Attributes:
+        gripper: Position between the fingers, (3,) [m].
+        opening: Distance between the fingers [m].
+        object: Position of the cube, or of the gripper if there is no cube, (3,) [m].
+        object_velocity: Its velocity, (3,) [m/s].
+        goal: Desired goal, (3,) [m].
+    """
+
+    gripper: F64
+    opening: float
+    object: F64
+    object_velocity: F64
+    goal: F64
+
+
+def scene_of(env: Any) -> FetchScene:
+    """Return what the ladders read from the present state of an environment."""
+    inner = env.unwrapped
+    model, data = inner.model, inner.data
+    fingers = (data.joint(f"robot0:{side}_gripper_finger_joint").qpos[0] for side in "rl")
+    moved = "object0" if inner.has_object else "robot0:grip"
+    return FetchScene(
+        data.site("robot0:grip").xpos,
+        float(sum(fingers)),
+        data.site(moved).xpos,
+        inner._utils.get_site_xvelp(model, data, moved),
+        inner.goal,
+    )
+
+
+def _to_cube(scene: FetchScene) -> F64:
     """Vector from gripper to cube, (3,) [m]."""
-    return env.object - env.gripper
+    return scene.object - scene.gripper
 
 
-def _to_grasp(env: FetchEnv) -> F64:
+def _to_grasp(scene: FetchScene) -> F64:
     """Vector from gripper to where it grasps the cube, (3,) [m]."""
-    return _to_cube(env) + [0, 0, GRASP_HEIGHT]
+    return _to_cube(scene) + [0, 0, GRASP_HEIGHT]
 
 
-def _holds(env: FetchEnv) -> bool:
-    return bool((np.abs(_to_grasp(env)) < GRASPED).all() and env.opening < HELD)
+def _holds(scene: FetchScene) -> bool:
+    return bool((np.abs(_to_grasp(scene)) < GRASPED).all() and scene.opening < HELD)
 
 
-def _between(env: FetchEnv) -> bool:
+def _between(scene: FetchScene) -> bool:
     """Whether the cube is between the fingers, or will be before they have closed."""
-    wide = env.opening > 2 * HALF + OPENING * max(0.0, abs(_to_grasp(env)[0]) - 0.02)
-    return wide and bool((np.abs(_to_grasp(env)) < NEAR).all())
+    wide = scene.opening > 2 * HALF + OPENING * max(0.0, abs(_to_grasp(scene)[0]) - 0.02)
+    return wide and bool((np.abs(_to_grasp(scene)) < NEAR).all())
 
 
-def _grasp(env: FetchEnv) -> tuple[F64, float]:
+def _grasp(scene: FetchScene) -> F64:
     """Go to the cube; close to it, lead towards the goal, so that a finger takes the cube along."""
-    way = _to_grasp(env)
+    way = _to_grasp(scene)
     share = max(0.0, 1 - np.abs(way).max() / CLOSED_ON)
-    way[1] += share * np.clip(env.goal[1] - env.object[1], -LEAD, LEAD)
-    return way, CLOSE
+    way[1] += share * np.clip(scene.goal[1] - scene.object[1], -LEAD, LEAD)
+    return way
 
 
-def _over(env: FetchEnv) -> tuple[F64, float]:
+def _over(scene: FetchScene) -> F64:
     """Go to the cube, but not below its top before the fingers are on both sides of it."""
-    way = _to_grasp(env)
-    if abs(way[1]) > STRADDLE or env.opening < 2 * HALF + 0.01:
-        way[2] = max(way[2], _to_cube(env)[2] + CLEAR)
-    return way, OPEN
+    way = _to_grasp(scene)
+    if abs(way[1]) > STRADDLE or scene.opening < 2 * HALF + 0.01:
+        way[2] = max(way[2], _to_cube(scene)[2] + CLEAR)
+    return way
 
 
-def _rests_at_goal(env: FetchEnv) -> bool:
+def _rests_at_goal(scene: FetchScene) -> bool:
     """Whether the cube is at the goal, or will slide there by itself."""
-    velocity = env.object_velocity[:2]
-    left = (env.goal - env.object)[:2] - velocity * np.hypot(*velocity) / (2 * DECELERATION)
+    velocity = scene.object_velocity[:2]
+    left = (scene.goal - scene.object)[:2] - velocity * np.hypot(*velocity) / (2 * DECELERATION)
     return bool(np.hypot(*left) < AT_GOAL)
 
 
-def _direction(env: FetchEnv) -> F64:
+def _direction(scene: FetchScene) -> F64:
     """Direction in which to move the cube, a unit vector in the plane, (2,)."""
-    way = (env.goal - env.object)[:2] - LOOK * env.object_velocity[:2]
+    way = (scene.goal - scene.object)[:2] - LOOK * scene.object_velocity[:2]
     return way / max(float(np.hypot(*way)), 1e-6)
 
 
@@ -109,42 +140,42 @@ def _touching(direction: F64) -> float:
     return float(min(BOX / np.maximum(np.abs(direction), 1e-6)))
 
 
-def _is_behind(env: FetchEnv) -> bool:
-    direction, way = _direction(env), _to_cube(env)[:2]
+def _is_behind(scene: FetchScene) -> bool:
+    direction, way = _direction(scene), _to_cube(scene)[:2]
     along, off = way @ direction, abs(way[0] * direction[1] - way[1] * direction[0])
     return bool(
-        0 < along < _touching(direction) + ALONG and off < ACROSS and -_to_cube(env)[2] < BELOW
+        0 < along < _touching(direction) + ALONG and off < ACROSS and -_to_cube(scene)[2] < BELOW
     )
 
 
-def _push(env: FetchEnv) -> tuple[F64, float]:
+def _push(scene: FetchScene) -> F64:
     """Move at full speed in the direction to push, and towards the line through cube and goal."""
-    direction = _direction(env)
+    direction = _direction(scene)
     across = np.array([-direction[1], direction[0]])
     way = direction * (REACH / np.abs(direction).max()) + CENTRING * across * (
-        _to_cube(env)[:2] @ across
+        _to_cube(scene)[:2] @ across
     )
-    return np.append(way, _to_cube(env)[2] + LOW), CLOSE
+    return np.append(way, _to_cube(scene)[2] + LOW)
 
 
-def _ends(env: FetchEnv) -> tuple[F64, F64]:
+def _ends(scene: FetchScene) -> tuple[F64, F64]:
     """Positions of the gripper now and behind the cube, both relative to the cube, (2,) [m]."""
-    direction = _direction(env)
-    return -_to_cube(env)[:2], -direction * (_touching(direction) + AHEAD)
+    direction = _direction(scene)
+    return -_to_cube(scene)[:2], -direction * (_touching(direction) + AHEAD)
 
 
-def _around(env: FetchEnv) -> tuple[F64, float]:
+def _around(scene: FetchScene) -> F64:
     """Go behind the cube, past its corners, as far as one step goes."""
-    start, end = _ends(env)
-    return np.append(_walk(start, _path(start, end)), _to_cube(env)[2] + LOW), CLOSE
+    start, end = _ends(scene)
+    return np.append(_walk(start, _path(start, end)), _to_cube(scene)[2] + LOW)
 
 
-def _is_better_over(env: FetchEnv) -> bool:
+def _is_better_over(scene: FetchScene) -> bool:
     """Whether the cube is in the way, and the path around it is long or the gripper is high
     already.
     """
-    start, end = _ends(env)
-    height = -_to_cube(env)[2]
+    start, end = _ends(scene)
+    height = -_to_cube(scene)[2]
     if _is_free(start, end) or (_is_inside(start) and height < HIGH - 0.02):
         return False
     around = sum(
@@ -154,18 +185,18 @@ def _is_better_over(env: FetchEnv) -> bool:
     return height >= HIGH - 0.015 or around - np.abs(end - start).max() >= DETOUR
 
 
-def _over_cube(env: FetchEnv) -> tuple[F64, float]:
+def _over_cube(scene: FetchScene) -> F64:
     """Go straight over the cube to behind it: rise before crossing it, and descend as soon as it
     is past.
     """
-    start, end = _ends(env)
+    start, end = _ends(scene)
     way = _walk(start, [end])
-    if not _is_inside(start) and REACH - _to_cube(env)[2] < HIGH:
+    if not _is_inside(start) and REACH - _to_cube(scene)[2] < HIGH:
         share = next((one for one in (1, 0.75, 0.5, 0.25) if not _is_inside(start + one * way)), 0)
-        return np.append(share * way, _to_cube(env)[2] + HIGH), CLOSE
+        return np.append(share * way, _to_cube(scene)[2] + HIGH)
     soon = start + DOWN * way
     height = LOW if not _is_inside(soon) and _is_free(soon, end) else HIGH
-    return np.append(way, _to_cube(env)[2] + height), CLOSE
+    return np.append(way, _to_cube(scene)[2] + height)
 
 
 def _is_inside(place: F64) -> bool:
@@ -215,38 +246,30 @@ def _is_free(start: F64, end: F64) -> bool:
     return bool(enters >= leaves or leaves <= 0 or enters >= 1)
 
 
-LADDERS: dict[str, tuple[PackagedRung, ...]] = {
-    "FetchReach-v4": (
-        PackagedRung("approach", always, lambda env: (env.goal - env.gripper, CLOSE)),
-    ),
-    "FetchPush-v4": (
-        PackagedRung("hold", _rests_at_goal, lambda env: (np.zeros(3), CLOSE)),
-        PackagedRung("push", _is_behind, _push),
-        PackagedRung("approach", _is_better_over, _over_cube),
-        PackagedRung("approach", always, _around),
-    ),
-    "FetchPickAndPlace-v4": (
-        PackagedRung("carry", _holds, lambda env: (env.goal - env.object, CLOSE)),
-        PackagedRung("grasp", _between, _grasp),
-        PackagedRung("approach", always, _over),
-    ),
+def _reach_task(scene: FetchScene) -> tuple[str, F64, float]:
+    return "approach", scene.goal - scene.gripper, CLOSE
+
+
+def _push_task(scene: FetchScene) -> tuple[str, F64, float]:
+    if _rests_at_goal(scene):
+        return "hold", np.zeros(3), CLOSE
+    if _is_behind(scene):
+        return "push", _push(scene), CLOSE
+    way = _over_cube(scene) if _is_better_over(scene) else _around(scene)
+    return "approach", way, CLOSE
+
+
+def _pick_task(scene: FetchScene) -> tuple[str, F64, float]:
+    if _holds(scene):
+        return "carry", scene.goal - scene.object, CLOSE
+    if _between(scene):
+        return "grasp", _grasp(scene), CLOSE
+    return "approach", _over(scene), OPEN
+
+
+# task -> its ladder: the phase, the gripper's displacement (3,) [m] and the fingers' command
+LADDERS = {
+    "FetchReach-v4": _reach_task,
+    "FetchPush-v4": _push_task,
+    "FetchPickAndPlace-v4": _pick_task,
 }
-
-
-class FetchExpert(Expert):
-    """Labels any state of one of Fetch's tasks."""
-
-    def __init__(self, task: str):
-        self._env = FetchEnv(task)
-        self._ladder = LADDERS[task]
-
-    @override
-    def label(self, state: State, environment: Environment | None = None) -> Label:
-        self._env.set_state(state)
-        rung = next(rung for rung in self._ladder if rung.holds(self._env))
-        way, fingers = rung.target(self._env)
-        phase = self._env.task.phases.index(rung.name)
-        return Label(np.append(np.clip(way / REACH, -1, 1), fingers), phase, True, 0.0)
-
-
-WORLD = Packaged(FetchEnv, FetchExpert)

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from importlib.metadata import entry_points, packages_distributions, version
 from pathlib import Path
-from typing import Any, override
+from typing import Any, ClassVar, override
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import F64, Label, Observation, State
 from manip_il.option import NameOrPath
 from manip_il.own_file import own_class, source_hash
@@ -41,7 +43,6 @@ from manip_il.worlds.gym.restoring import Simulated, flat, simulation, unflat
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 
 SEEDS = 4  # episodes that are begun to see what is part of a state
-_MOST_SEED = 2**32  # older environments take none that is larger
 _TOLERANCE = 0.05  # [m]; not used, as such a world says by itself what is solved
 
 
@@ -71,10 +72,13 @@ class GymEnv(Environment):
             should.
     """
 
+    most_seed: ClassVar[int] = 2**32  # older environments take none that is larger
+    hashes_code: ClassVar[bool] = True  # whether its fingerprint has the world's and its package's
+
     def __init__(self, world: GymWorld, cameras: CameraConfig | None = None, horizon: int = 0):
         self.world, self._cameras = world, cameras
         self.env = made(world)
-        self.actions = _actions(world, self.env.action_space)
+        self.actions = self._found_actions()
         simulated = simulation(self.env)
         self._simulated, self._fresh = None, np.empty(0)
         self._is_own = _overrides(world, "restore")
@@ -96,18 +100,17 @@ class GymEnv(Environment):
     @override
     def progress(self) -> float:
         if not self._spec.has_progress:
-            return float(self._solved)
+            return float(self._streak > 0)
         return float(self.world.progress(self.env, self._info))
 
     @override
     def start(self, seed: int) -> None:
         if self._simulated:  # nothing is left of an earlier episode
             self._simulated.set(self._fresh)
-        self._seen, self._info = self.world.reset(self.env, seed % _MOST_SEED)
+        self._seen, self._info = self.world.reset(self.env, seed % self.most_seed)
         if self._simulated:  # poses that belong to the state, as after it is restored
             self._simulated.forward()
-        self._count(0, 0, False)
-        self._solved, self._label = False, None
+        self._count_from(State(np.empty(0), np.empty(0)))
 
     @override
     def observe(self) -> Observation:
@@ -128,11 +131,12 @@ class GymEnv(Environment):
         self._seen, reward, terminated, truncated, self._info = self.env.step(
             given.astype(self.env.action_space.dtype)
         )
-        self._solved, self._label = bool(self.world.solved(self.env, self._info)), None
-        self._count(
-            self._step + 1, self._streak + 1 if self._solved else 0, self._ever or self._solved
-        )
-        return Outcome(action, float(reward), self._solved, bool(terminated or truncated))
+        self._label = None
+        solved = bool(self.world.solved(self.env, self._info))
+        self._step += 1
+        self._streak = self._streak + 1 if solved else 0
+        self._ever = self._ever or solved
+        return Outcome(action, float(reward), solved, bool(terminated or truncated))
 
     def label(self) -> Label:
         """Return the expert's label of the present state; the expert is asked once a step."""
@@ -154,31 +158,37 @@ class GymEnv(Environment):
     @override
     def set_state(self, state: State) -> None:
         self._spec.require("restored", "give its class `state` and `restore`")
+        size, expected = len(state.to_vector()), self._spec.sim_state_size
+        if size != expected:
+            raise MismatchError("size of the state", "it", size, self._spec.task, expected)
         if self._simulated:
             self._simulated.set(state.physics)
         else:
             self.world.restore(self.env, state.physics)
         self._seen, self._info = unflat(state.variation, self._seen), {}
-        self._count(state.step, state.streak, state.ever)
-        self._solved, self._label = state.streak > 0, None
+        self._count_from(state)
 
     @override
     def positions(self) -> dict[str, F64]:
-        return {name: np.asarray(at) for name, at in self.world.positions(self.env).items()}
+        return dict(self.world.positions(self.env))
 
-    def _count(self, step: int, streak: int, ever: bool) -> None:
-        self._step, self._streak = step, streak
-        self._ever = ever
+    def _count_from(self, state: State) -> None:
+        self._step, self._streak = state.step, state.streak
+        self._ever, self._label = state.ever, None
 
     def _numbers_seen(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return `agent_pos` and `environment_state` as the world gives them."""
         found = self.world.observe(self.env, self._seen)
-        if not isinstance(found, Mapping) or not found.keys() & {AGENT, AROUND}:
-            raise UsageError(
-                f"observe of {_name(self.world)} returned {checks.shorten(found)}; expected a"
-                f" mapping with {AGENT}, {AROUND} or both"
-            )
-        return (_numbers(self.world, found, AGENT), _numbers(self.world, found, AROUND))
+        try:
+            if found.keys() & {AGENT, AROUND}:
+                mine = np.ravel(np.asarray(found.get(AGENT, ()), np.float32))
+                return mine, np.ravel(np.asarray(found.get(AROUND, ()), np.float32))
+        except (AttributeError, TypeError, ValueError):
+            pass
+        raise UsageError(
+            f"observe of {_name(self.world)} returned {checks.shorten(found)}; expected a mapping"
+            f" with the numbers {AGENT}, {AROUND} or both"
+        )
 
     def _checked(self, given: Any) -> Label:
         if isinstance(given, Label):
@@ -192,6 +202,15 @@ class GymEnv(Environment):
                 f" expected {self.actions.low.shape}"
             )
         return replace(label, action=np.clip(label.action, self.actions.low, self.actions.high))
+
+    def _found_actions(self) -> GymActions:
+        world, space = self.world, self.env.action_space
+        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+            raise UsageError(f"actions of {_name(world)} are {space}; expected a flat Box")
+        low, high = (np.asarray(one, np.float64) for one in (space.low, space.high))
+        scale = np.where(np.isfinite(high - low), high - low, 1.0)
+        names = _names(world, "action", len(low))
+        return GymActions(names, low, high, scale, np.zeros(len(low), bool))
 
     def _found_state(self, model: Any, data: Any) -> Simulated:
         """Return what restores the environment, as seen in the first steps of some episodes."""
@@ -241,19 +260,18 @@ class GymExpert(Expert):
     """The expert of a world: its `act`.
 
     Args:
-        cls: The world.
-        task: Its task.
+        make: Returns a new environment of the world.
     """
 
-    def __init__(self, cls: type[GymWorld], task: str):
-        self._world, self._env = lambda: cls(task), None
+    def __init__(self, make: Callable[[], GymEnv]):
+        self._make, self._env = make, None
 
     @override
     def label(self, state: State, environment: Environment | None = None) -> Label:
         if isinstance(environment, GymEnv):
             return environment.label()
         if self._env is None:
-            self._env = GymEnv(self._world())
+            self._env = self._make()
         if self._env.world.recurrent:
             raise Unable(
                 f"the expert of {self._env.spec.robot} keeps memory, so it labels the states of a"
@@ -268,10 +286,11 @@ class GymKind(WorldKind):
 
     Args:
         cls: The class.
+        env: What puts its environments behind the contract.
     """
 
-    def __init__(self, cls: type[GymWorld]):
-        self._cls = cls
+    def __init__(self, cls: type[GymWorld], env: type[GymEnv] = GymEnv):
+        self._cls, self._env = cls, env
 
     @override
     def complete(self, config: EnvConfig) -> EnvConfig:
@@ -303,13 +322,12 @@ class GymKind(WorldKind):
 
     def _task(self, config: EnvConfig) -> str:
         """Return the chosen task; "" if the world has only one."""
-        asked = str(config.task)
-        if not self._cls.tasks:
-            if asked not in (EnvConfig.task, "", _name(self._cls)):
-                raise UnknownName(f"task of {_name(self._cls)}", asked, [_name(self._cls)])
+        asked, name = str(config.task), _name(self._cls)
+        if not self._cls.tasks and asked in (EnvConfig.task, "", name):
             return ""
-        if asked not in self._cls.tasks:
-            raise UnknownName(f"task of {_name(self._cls)}", asked, self._cls.tasks)
+        known = self._cls.tasks or (name,)
+        if asked not in known:
+            raise UnknownName(f"task of {name}", asked, known)
         return asked
 
     @override
@@ -323,28 +341,34 @@ class GymKind(WorldKind):
             cameras: Cameras rendered in every step; None for none.
             conditions: Without ranges, as these environments cannot be varied.
         """
-        return GymEnv(self._cls(self._task(config)), cameras, config.horizon)
+        return self._env(self._cls(self._task(config)), cameras, config.horizon)
 
     @override
     def expert(self, config: EnvConfig) -> GymExpert:
-        return GymExpert(self._cls, self._task(config))
+        return GymExpert(partial(self.environment, config, None, ()))
 
     @override
     def drawing_version(self, config: EnvConfig) -> int:
         return DRAWN
 
     @override
+    def own_files(self, spec: Any, shape: str) -> list[str]:
+        tasks = self._cls.tasks
+        return [f"--task.type={'|'.join(tasks)}"] if tasks and spec.task not in tasks else []
+
+    @override
     def fingerprint(self, config: EnvConfig) -> dict[str, str]:
         settings, env = asdict(config), self.environment(config, None, ())
         del settings["object"]  # there is none
         settings["robot"] = _name(self._cls)
-        inner = env.env.unwrapped
-        package = type(inner).__module__.partition(".")[0]
-        sold = [f"{name} {version(name)}" for name in packages_distributions().get(package, [])]
         simulated = simulation(env.env)
         model = model_bytes(simulated[0]) if simulated else b""
-        own = {"world_sha256": source_hash(self._cls)}
-        return environment_fingerprint(model, settings) | own | {"package": ", ".join(sold)}
+        found = environment_fingerprint(model, settings)
+        if not env.hashes_code:
+            return found
+        package = type(env.env.unwrapped).__module__.partition(".")[0]
+        sold = [f"{name} {version(name)}" for name in packages_distributions().get(package, [])]
+        return found | {"world_sha256": source_hash(self._cls), "package": ", ".join(sold)}
 
 
 def own_kind(robot: Path | str) -> GymKind | None:
@@ -373,6 +397,20 @@ def made(world: GymWorld) -> gymnasium.Env[Any, Any]:
     return env
 
 
+@contextmanager
+def installed(world: GymWorld, how: str) -> Iterator[None]:
+    """Import the package that a world comes from.
+
+    Raises `ManipError` with the command that installs it if something is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ManipError(
+            f"{_name(world)} needs {error.name}, which is not installed: {how}"
+        ) from error
+
+
 def settings_of(world: GymWorld, env: gymnasium.Env[Any, Any] | None) -> dict[str, Any]:
     """Return rate [Hz] and horizon of a world, from its class or its environment.
 
@@ -394,6 +432,11 @@ def settings_of(world: GymWorld, env: gymnasium.Env[Any, Any] | None) -> dict[st
     return found
 
 
+def coordinates(*names: str) -> tuple[str, ...]:
+    """Return the names of the coordinates of vectors."""
+    return tuple(f"{name}.{axis}" for name in names for axis in "xyz")
+
+
 def _name(world: GymWorld | type[GymWorld]) -> str:
     cls = world if isinstance(world, type) else type(world)
     return cls.name or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
@@ -407,24 +450,5 @@ def _names(world: GymWorld, key: str, count: int) -> tuple[str, ...]:
     return given or tuple(f"{key}_{place}" for place in range(count))
 
 
-def _numbers(world: GymWorld, found: Mapping[str, Any], key: str) -> NDArray[np.float32]:
-    """Return the numbers of a key of what `observe` returned, (k,)."""
-    try:
-        return np.ravel(np.asarray(found.get(key, ()), np.float32))
-    except (TypeError, ValueError) as error:
-        raise UsageError(
-            f"{key} of {_name(world)} is {checks.shorten(found[key])}; expected numbers"
-        ) from error
-
-
 def _overrides(world: GymWorld, name: str) -> bool:
     return getattr(type(world), name) is not getattr(GymWorld, name)
-
-
-def _actions(world: GymWorld, space: Any) -> GymActions:
-    if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-        raise UsageError(f"actions of {_name(world)} are {space}; expected a flat Box")
-    low, high = (np.asarray(one, np.float64) for one in (space.low, space.high))
-    scale = np.where(np.isfinite(high - low), high - low, 1.0)
-    names = _names(world, "action", len(low))
-    return GymActions(names, low, high, scale, np.zeros(len(low), bool))

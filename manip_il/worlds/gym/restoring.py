@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError
 from manip_il.mdp import F64
 
 WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -64,7 +64,10 @@ class Simulated:
 
     def get(self) -> F64:
         """Return the state, (p,)."""
-        found = [self._physics(), *(np.ravel(array) for array in self._differing.values())]
+        found = [
+            physics_of(self._model, self._data),
+            *(np.ravel(array) for array in self._differing.values()),
+        ]
         for place, like in self._like.items():
             value = getattr(*place)
             if place in self._may_be_none:
@@ -80,10 +83,7 @@ class Simulated:
         return np.concatenate([one.astype(np.float64) for one in found])
 
     def set(self, state: F64) -> None:
-        """Restore a state, (p,). Raises `MismatchError` for one of another size."""
-        size = len(self.get())
-        if len(state) != size:
-            raise MismatchError("size of the state", "it", len(state), "the world", size)
+        """Restore a state, (p,)."""
         begin = 0
         physics, rest = np.split(state, [self._size])
         for array in self._differing.values():
@@ -102,15 +102,17 @@ class Simulated:
 
     def forward(self) -> None:
         """Compute everything of MuJoCo's data that follows from the state."""
-        physics = self._physics()
+        physics = physics_of(self._model, self._data)
         mujoco.mj_forward(self._model, self._data)
         # because `mj_forward` has changed where the next step's solver begins
         mujoco.mj_setState(self._model, self._data, physics, WHOLE)
 
-    def _physics(self) -> F64:
-        physics = np.empty(self._size)
-        mujoco.mj_getState(self._model, self._data, physics, WHOLE)
-        return physics
+
+def physics_of(model: mujoco.MjModel, data: mujoco.MjData) -> F64:
+    """Return MuJoCo's integration state, (p,)."""
+    physics = np.empty(mujoco.mj_stateSize(model, WHOLE))
+    mujoco.mj_getState(model, data, physics, WHOLE)
+    return physics
 
 
 def _converted(numbers: F64, like: Any) -> Any:
