@@ -1,6 +1,7 @@
 """Run DAgger, or another algorithm of imitation, in a folder."""
 
 import json
+import logging
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from manip_il.collect.inputs import check_policy, open_dataset
 from manip_il.collect.query import parse_query
 from manip_il.collect.workers import Engine, engine_of
 from manip_il.data.atomic import CONFIG_FILE, output_of, require_ours, write_json
+from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import SIM_STATE, check_same_spec, features
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import Checkpoint
@@ -21,6 +23,8 @@ from manip_il.option import make_options
 from manip_il.progress import Progress
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import env_fingerprint, env_of_name, env_spec
+
+_LOG = logging.getLogger(__name__)
 
 
 def dagger(
@@ -64,7 +68,7 @@ def dagger(
     # from the command line, which compares its options itself
     if not (folder / CONFIG_FILE).is_file():
         _check_same(folder / "settings.json", config)
-    write_json(folder / "fingerprint.json", env_fingerprint(config.env, config.cameras))
+    _warn_of_changes(folder / "fingerprint.json", env_fingerprint(config.env, config.cameras))
     results = list[Result]()
     with engine_of(workers) as engine:
         engine.warm_up(learned=True)
@@ -123,6 +127,14 @@ def check_inputs(config: RunConfig) -> None:
             )
     if config.start is not None:
         check_policy(Checkpoint.open(config.start), config.env, trust=config.fit.trust)
+
+
+def _warn_of_changes(path: Path, now: dict[str, str]) -> None:
+    """Warn if a run began in an environment other than now; then write what it is now."""
+    before = checks.read_json(path, "a run's fingerprint") if path.is_file() else now
+    for line in compare_fingerprints(str(path.parent), before, "this program", now):
+        _LOG.warning(line)
+    write_json(path, now)
 
 
 def _check_same(path: Path, config: RunConfig) -> None:

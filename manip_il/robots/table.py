@@ -56,7 +56,7 @@ def get_robot(name: NameOrPath) -> Robot:
                 f"robot {name} of {found.value}: {why}; expected the path of a YAML"
             ) from error
         return _read(path.absolute())
-    raise UnknownName("robot", name, (*ROBOTS, "the path of a YAML"))
+    raise UnknownName("robot", name, (*ROBOTS, "the path of a YAML or of a world's Python file"))
 
 
 def is_robot(name: str) -> bool:

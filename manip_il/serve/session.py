@@ -15,7 +15,7 @@ import numpy as np
 
 from manip_il.collect.drivers import policy_actions
 from manip_il.collect.rollout import Turn
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UsageError
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.mdp import F64, Actor
@@ -28,8 +28,8 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.view import Window
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.world import env_of
-from manip_il.worlds.table import env_spec
+from manip_il.worlds.ladder.world import WORLD, env_of
+from manip_il.worlds.table import env_spec, world_of
 
 Say = Callable[[str], None]
 # a window's frame rate, so high that it never waits: the station keeps real time [Hz]
@@ -70,6 +70,8 @@ def serve(
     sys.setswitchinterval(5e-4)  # [s]: short enough for the threads of the buses to answer in time
     with contextlib.ExitStack() as stack:
         stack.callback(weigh_session, weigh_session() or "0")
+        if world_of(env.robot) is not WORLD:
+            raise UsageError(f"{env_spec(env).robot} has no Feetech servos; choose another robot")
         station = Station(env_of(env, None, conditions), config)
         stack.callback(station.close)
         shown = Cameras(station, cameras, config.camera_port) if cameras is not None else None

@@ -17,7 +17,7 @@ from manip_il.worlds.config import WORLDS
 from manip_il.worlds.several import PRESENT, divide, task_number
 from manip_il.worlds.table import env_spec, make_config, make_env, make_expert, task_names
 
-SEVERAL = ("panda", "lift,stack,reach")
+SEVERAL = ("panda", "lift,reach,stack")
 KINDS = [
     ("panda", "sort"),
     SEVERAL,

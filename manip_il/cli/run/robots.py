@@ -86,8 +86,8 @@ def run_check(options: RobotCheckOptions) -> None:
 def run_certify(options: CertifyOptions) -> None:
     """Run the episodes, write `certificate.json`, print the tables."""
     env = env_config(options.env)
+    count = count_episodes(env, options.cases)
     with options.open() as folder:
-        count = count_episodes(env, options.cases)
         with (
             progress(count, f"certify {env.robot} {env.task}") as bar,
             options.open_engine() as engine,

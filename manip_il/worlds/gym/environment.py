@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.errors import ManipError, MismatchError, NotFiniteError, UnknownName, UsageError
 from manip_il.mdp import F64, Label, Observation, State
 from manip_il.option import NameOrPath
 from manip_il.own_file import own_class, source_hash
@@ -37,8 +38,8 @@ from manip_il.worlds.contract import (
     WorldKind,
 )
 from manip_il.worlds.fingerprint import environment_fingerprint
+from manip_il.worlds.gym.drawing import RENDER, camera_names, draw
 from manip_il.worlds.gym.drawing import VERSION as DRAWN
-from manip_il.worlds.gym.drawing import camera_names, draw
 from manip_il.worlds.gym.restoring import Simulated, flat, simulation, unflat
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 
@@ -81,7 +82,7 @@ class GymEnv(Environment):
         self.actions = self._found_actions()
         simulated = simulation(self.env)
         self._simulated, self._fresh = None, np.empty(0)
-        self._is_own = _overrides(world, "restore")
+        self._is_own, self._sizes = _overrides(world, "restore"), ()
         self.start(0)
         if simulated and not self._is_own:
             self._simulated = self._found_state(*simulated)
@@ -141,7 +142,11 @@ class GymEnv(Environment):
     def label(self) -> Label:
         """Return the expert's label of the present state; the expert is asked once a step."""
         if self._label is None:
-            self._label = self._checked(self.world.act(self.env, deepcopy(self._seen)))
+            try:
+                given = self.world.act(self.env, deepcopy(self._seen))
+            except NotFiniteError as error:  # of a `Label`
+                raise UsageError(f"{_at(self.world, 'act')}: {error}") from error
+            self._label = self._checked(given)
         return self._label
 
     @override
@@ -179,34 +184,40 @@ class GymEnv(Environment):
     def _numbers_seen(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return `agent_pos` and `environment_state` as the world gives them."""
         found = self.world.observe(self.env, self._seen)
-        try:
-            if found.keys() & {AGENT, AROUND}:
-                mine = np.ravel(np.asarray(found.get(AGENT, ()), np.float32))
-                return mine, np.ravel(np.asarray(found.get(AROUND, ()), np.float32))
-        except (AttributeError, TypeError, ValueError):
-            pass
-        raise UsageError(
-            f"observe of {_name(self.world)} returned {checks.shorten(found)}; expected a mapping"
-            f" with the numbers {AGENT}, {AROUND} or both"
-        )
+        if not isinstance(found, Mapping) or not found.keys() & {AGENT, AROUND}:
+            raise UsageError(
+                f"{_at(self.world, 'observe')}: returned {checks.shorten(found)}; expected a"
+                f" mapping with {AGENT}, {AROUND} or both"
+            )
+        mine, around = (_numbers(self.world, found, key) for key in (AGENT, AROUND))
+        sizes = (len(mine), len(around))
+        if sizes != (self._sizes or sizes):
+            raise UsageError(
+                f"{_at(self.world, 'observe')}: {AGENT} and {AROUND} have {sizes} numbers; expected"
+                f" {self._sizes} as before"
+            )
+        self._sizes = sizes
+        return mine, around
 
     def _checked(self, given: Any) -> Label:
-        if isinstance(given, Label):
-            action, label = given.action, given
-        else:
-            action = np.asarray(given, np.float64)
-            label = Label(np.ravel(action), 1, True, 0.0)
-        if np.shape(action) != self.actions.low.shape:
+        label = given if isinstance(given, Label) else None
+        try:
+            action = np.asarray(label.action if label else given, np.float64)
+        except (TypeError, ValueError):
+            action = np.empty(0)
+        size = len(self.actions.low)
+        if action.shape != (size,) or not np.isfinite(action).all():
             raise UsageError(
-                f"act of {_name(self.world)} returned an action of shape {np.shape(action)};"
-                f" expected {self.actions.low.shape}"
+                f"{_at(self.world, 'act')}: action is {checks.shorten(given)}; expected {size}"
+                " finite numbers"
             )
-        return replace(label, action=np.clip(label.action, self.actions.low, self.actions.high))
+        label = label or Label(action, 1, True, 0.0)
+        return replace(label, action=np.clip(action, self.actions.low, self.actions.high))
 
     def _found_actions(self) -> GymActions:
         world, space = self.world, self.env.action_space
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-            raise UsageError(f"actions of {_name(world)} are {space}; expected a flat Box")
+            raise UsageError(f"{_at(world, 'make')}: actions are {space}; expected a flat Box")
         low, high = (np.asarray(one, np.float64) for one in (space.low, space.high))
         scale = np.where(np.isfinite(high - low), high - low, 1.0)
         names = _names(world, "action", len(low))
@@ -229,6 +240,10 @@ class GymEnv(Environment):
         cameras = world.cameras
         if cameras is None:
             cameras = camera_names(env)
+        elif not _overrides(world, "render"):
+            known = {*camera_names(env), *RENDER}
+            if wrong := [name for name in cameras if name not in known]:
+                raise UnknownName(f"camera of {_name(world)}", wrong[0], known)
         restores = (self._simulated or self._is_own) and self._numbers is not None
         can = list[Ability](["drawn"] if cameras else [])
         if restores and not world.recurrent:
@@ -290,6 +305,12 @@ class GymKind(WorldKind):
     """
 
     def __init__(self, cls: type[GymWorld], env: type[GymEnv] = GymEnv):
+        for name in ("make", "act"):
+            if not _overrides(cls, name):
+                raise UsageError(
+                    f"{inspect.getfile(cls)}: class {cls.__name__} has no `{name}`, which is"
+                    " required (docs/new-env.md)"
+                )
         self._cls, self._env = cls, env
 
     @override
@@ -392,7 +413,7 @@ def made(world: GymWorld) -> gymnasium.Env[Any, Any]:
     env: Any = world.make()
     if not (hasattr(env, "unwrapped") and hasattr(env, "action_space")):
         raise UsageError(
-            f"make of {_name(world)} returned {checks.shorten(env)}; expected a gymnasium.Env"
+            f"{_at(world, 'make')}: returned {checks.shorten(env)}; expected a gymnasium.Env"
         )
     return env
 
@@ -428,7 +449,10 @@ def settings_of(world: GymWorld, env: gymnasium.Env[Any, Any] | None) -> dict[st
     }
     for name, value in found.items():
         if not value:
-            raise UsageError(f"{_name(world)} has no {name}; give its class one")
+            raise UsageError(
+                f"{_name(world)} has no {name}; give its class one, in"
+                f" {inspect.getfile(type(world))}"
+            )
     return found
 
 
@@ -450,5 +474,29 @@ def _names(world: GymWorld, key: str, count: int) -> tuple[str, ...]:
     return given or tuple(f"{key}_{place}" for place in range(count))
 
 
-def _overrides(world: GymWorld, name: str) -> bool:
-    return getattr(type(world), name) is not getattr(GymWorld, name)
+def _numbers(world: GymWorld, found: Mapping[str, Any], key: str) -> NDArray[np.float32]:
+    """Return the numbers of a key of what `observe` returned, (k,)."""
+    try:
+        numbers = np.ravel(np.asarray(found.get(key, ()), np.float32))
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if not np.isfinite(numbers).all():
+        raise UsageError(
+            f"{_at(world, 'observe')}: {key} is {checks.shorten(found[key])}; expected finite"
+            " numbers"
+        )
+    return numbers
+
+
+def _overrides(world: GymWorld | type[GymWorld], name: str) -> bool:
+    cls = world if isinstance(world, type) else type(world)
+    return getattr(cls, name) is not getattr(GymWorld, name)
+
+
+def _at(world: GymWorld, method: str) -> str:
+    """Return where a method of a world is written: file, line and name."""
+    cls = type(world)
+    if not _overrides(world, method):
+        return f"{inspect.getfile(cls)} ({cls.__name__} has no {method})"
+    code = inspect.unwrap(getattr(cls, method)).__code__
+    return f"{code.co_filename}, line {code.co_firstlineno} ({method})"
