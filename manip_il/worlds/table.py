@@ -56,6 +56,7 @@ def task_names(config: EnvConfig) -> tuple[NameOrPath, ...]:
     return world_of(config.robot).tasks_in(config.task)
 
 
+@cache
 def _kind_of(robot: NameOrPath) -> WorldKind:
     is_file = isinstance(robot, Path) and robot.suffix == ".py"
     if is_file or entry_points(group=WORLD_GROUP, name=str(robot)):
