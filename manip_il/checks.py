@@ -34,7 +34,7 @@ MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
-_BETWEEN_TASKS = re.compile(r",(?!\w+=)", re.ASCII)
+_BETWEEN_TASKS = re.compile(r",(?!\s*\w+=)", re.ASCII)
 _NUMBERS = re.compile(r"\w+=[0-9.e+-]+(,\w+=[0-9.e+-]+)*", re.ASCII)
 _SURROGATE = re.compile("[\ud800-\udfff]")  # not Unicode on its own, so that no file can hold it
 _LONGEST_MESSAGE = 1_000  # [characters]

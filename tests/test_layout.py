@@ -132,7 +132,7 @@ def test_other_code_is_found_by_the_packages_own_tables_alone():
         ("bridges/mcap/importing.py", "read_messages"),
         ("option.py", "type_of"),
         ("sim/render.py", "_context"),
-        ("worlds/table.py", "world_of"),
+        ("worlds/table.py", "_kind_of"),
     }
 
 

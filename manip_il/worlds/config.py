@@ -82,5 +82,5 @@ class EnvConfig(Episodes):
         """Robot and task joined by "_": a file by its name without the suffix, a task without
         its argument.
         """
-        task = Path(self.task).stem.partition(":")[0].replace(",", "+")
+        task = Path(self.task).stem.partition(":")[0].replace(",", "-")
         return f"{Path(self.robot).stem}_{task}"
