@@ -186,8 +186,8 @@ class MLPPolicy(PreTrainedPolicy):
         return torch.cat([*parts, *self.texts(batch)], dim=-1)
 
     def texts(self, batch: Mapping[str, Any]) -> list[Tensor]:
-        """Return the network's inputs for the texts of a batch, one array (B, `LENGTH`); [] if it
-        reads none.
+        """Return the network's inputs for the texts of a batch, one array (B, l); [] if it reads
+        none.
         """
         if not self.config.reads_text:
             return []

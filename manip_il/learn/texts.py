@@ -34,7 +34,7 @@ def _tokens(text: str) -> Tensor:
 
 
 def tokens(texts: Sequence[str]) -> Tensor:
-    """Return texts as inputs of a network, (B, `LENGTH`), the same on every machine."""
+    """Return texts as inputs of a network, (B, l), the same on every machine; l is `LENGTH`."""
     return torch.stack([_tokens(text) for text in texts])
 
 
