@@ -49,10 +49,12 @@ def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> tuple[tupl
     Raises:
         ManipError: The dataset has no valid label, or the policy cannot be loaded.
     """
-    table = Dataset.open(root).columns(
-        (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE_INDEX)
-    )
+    dataset = Dataset.open(root)
+    table = dataset.columns((STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE_INDEX))
     learner, valid = LearnedPolicy.load(policy, trust=trust), table[LABEL_VALID].reshape(-1) != 0
+    episodes = dataset.episodes
+    texts = zip(episodes.index.tolist(), episodes.tasks, strict=True)
+    learner.begin({episode: text for episode, (text, *_) in texts})
     errors = [
         (actions - table[ACTION][rows])[valid[rows]]
         for rows, actions in actions_along(learner, table)

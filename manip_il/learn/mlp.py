@@ -191,8 +191,9 @@ class MLPPolicy(PreTrainedPolicy):
         """
         if not self.config.reads_text:
             return []
-        state = batch[STATE]
-        return [tokens(batch.get(TASK) or [""] * len(state)).to(state.device)]
+        if TASK not in batch:
+            raise UsageError("the policy reads the task's text, which is not given here")
+        return [tokens(batch[TASK]).to(batch[STATE].device)]
 
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
         return self.model.row_losses(inputs, batch[ACTION])

@@ -274,6 +274,8 @@ class MLPNetwork(nn.Module):
         """
         if self.reader is None:
             return self.layers(self.encode(inputs))
+        if inputs.shape[1] != self.inputs:
+            raise UsageError("the policy reads the task's text, which is not given here")
         hidden = self.encode(inputs)
         changes = self.reader(inputs[:, self.numbers :])
         for number, (factor, shift) in enumerate(changes):

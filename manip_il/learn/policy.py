@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
-from manip_il.errors import MismatchError, NotFiniteError
+from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import CONFIG, Checkpoint, in_one_line
 from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
@@ -205,7 +205,10 @@ class _Perceptron:
         parts = [batch[key] for key in self._keys]
         if self._reads:
             self._texts = {one: self._texts.get(one, "") for one in episodes}
-            parts.append(tokens([self._texts[one] or self._task for one in episodes]))
+            texts = [self._texts[one] or self._task for one in episodes]
+            if not all(texts):
+                raise UsageError("the policy reads the task's text, which is not given here")
+            parts.append(tokens(texts))
         inputs = torch.cat(parts, dim=1).to(self._device)
         targets = self.module.act(inputs).cpu().numpy()
         return torch.from_numpy(self._decode(targets, batch[STATE].numpy()))

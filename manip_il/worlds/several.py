@@ -139,6 +139,9 @@ class Tasks:
         if len(vector) != size:
             raise MismatchError("size of the state", "it", len(vector), self.spec.task, size)
         number = int(vector[0])
+        if not 0 <= number < len(self.parts):
+            most = len(self.parts) - 1
+            raise MismatchError("number of the task", "it", number, self.spec.task, f"0 to {most}")
         inner = State.from_vector(vector[1 : 1 + self._sizes[number]])
         return number, replace(inner, seed=state.seed, begun=state.begun)
 

@@ -122,9 +122,8 @@ def stored_config(
             raises.
     """
     given = {"robot": robot, "task": task, "object": shape}
-    needed = world_of(spec.robot, spec.task).own_files(
-        spec, ""
-    )  # what a mesh needs is told better below
+    # what a mesh needs is told better below
+    needed = world_of(spec.robot, spec.task).own_files(spec, "")
     if lacking := [one for one in needed if not given[FIELDS[one.partition("=")[0]]]]:
         raise UsageError(
             f"{spec.robot} {spec.task} was made with a file of your own; give {' '.join(lacking)}"

@@ -19,6 +19,9 @@ class Wrong:
         self.states = table["observation.state"]
         self.episodes: list[list[int]] = []
 
+    def begin(self, instructions):
+        assert set(instructions.values()) == {"Push."}
+
     def act(self, states, environment_states, images, episodes):
         self.episodes.append(list(episodes))
         rows = [int(np.flatnonzero((self.states == state).all(axis=1))[0]) for state in states]
@@ -39,7 +42,10 @@ def table() -> dict[str, np.ndarray]:
 
 def noise(table, errors, monkeypatch) -> tuple[np.ndarray, Wrong]:
     policy = Wrong(table, errors)
-    monkeypatch.setattr(Dataset, "open", lambda root: SimpleNamespace(columns=lambda names: table))
+    index = np.unique(table["episode_index"])
+    episodes = SimpleNamespace(index=index, tasks=[["Push."]] * len(index))
+    dataset = SimpleNamespace(columns=lambda names: table, episodes=episodes)
+    monkeypatch.setattr(Dataset, "open", lambda root: dataset)
     monkeypatch.setattr(LearnedPolicy, "load", lambda path, *, trust: policy)
     return np.array(dart.fitted_noise(Path("p"), Path("d"))), policy
 

@@ -7,7 +7,7 @@ from lerobot.policies.factory import make_pre_post_processors
 
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UsageError
 from manip_il.learn.export import export_onnx
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.mlp import MLPPolicy
@@ -57,6 +57,8 @@ def test_the_text_decides_where_nothing_else_does(policy, dataset):
     learned.begin(dict(enumerate(TEXTS * 3)))
     moved = learned.act(seen, around)[:, :-1] - seen[:, :-1]
     assert (np.sign(moved.mean(1)) == [1, -1] * 3).all()
+    with pytest.raises(UsageError, match=r"^the policy reads the task's text, which is not given"):
+        LearnedPolicy.load(policy).act(seen, around)
     learned.begin({7: TEXTS[1]})
     alone = learned.act(seen[1:2], around[1:2], episodes=[7])
     learned.begin(dict(enumerate(TEXTS * 3)))
