@@ -83,7 +83,8 @@ class Edit(Replacing):
     source: Path = option(MISSING, "a manip-il dataset; for redraw, also a run", positional=True)
     target: Path | None = option(
         None,
-        "folder of the new dataset; by default SOURCE_rendered, _relabelled or _redrawn",
+        "folder of the new dataset; by default SOURCE_rendered, _relabelled, _annotated or"
+        " _redrawn",
         positional=True,
     )
     robot: NameOrPath | None = option(
@@ -127,6 +128,18 @@ class RelabelOptions(Edit):
     changed: by more than 1 % of a joint's longest step, in phase, or in validity.
 
     Example: manip-il data relabel datasets/demos
+    """
+
+
+@dataclass(frozen=True)
+class AnnotateOptions(Edit):
+    """Add texts that are true of every frame: LeRobot's columns of language.
+
+    Subtasks, what is left, what is done, how the hand moves, other words for the task, where the
+    expert takes over from a policy, and, with cameras, questions with answers. They come from the
+    states and the expert, not from a model.
+
+    Example: manip-il data annotate datasets/demos
     """
 
 

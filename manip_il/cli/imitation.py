@@ -85,6 +85,9 @@ class RecordOptions(Varied, Seeded, EngineOptions, Resumable):
     )
     env: Given = given(EnvConfig)
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
+    language: bool = option(
+        False, "add texts that are true of every frame, as manip-il data annotate does"
+    )
 
 
 _OF_FIT = (

@@ -63,6 +63,7 @@ COMMANDS = {
         "randomise and render visited states for policies with cameras",
     ),
     "data relabel": ("data:RelabelOptions", "relabel a dataset with the current expert"),
+    "data annotate": ("data:AnnotateOptions", "add texts that are true of every frame"),
     "data build": ("data:BuildOptions", "rebuild a dataset from its journals"),
     "data merge": ("data:MergeOptions", "merge datasets of one robot and task"),
     "data score": (

@@ -9,7 +9,7 @@ render.
 The expert is a function of the state, so it can label scenes that were never visited.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -289,7 +289,7 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
     }
     fingerprint = {**env_fingerprint(source.env), **simulated}
     own = Own(dataset.spec, fingerprint, {**dataset.provenance, "relabelled": _origin(source)})
-    _rewrite(source, target, partial(label_states, source.env), own, dataset.stored_features)
+    rewrite(source, target, partial(label_states, source.env), own, dataset.stored_features)
     before, after = (one.columns(_LABELS) for one in (dataset, Dataset.open(target.root)))
     gaps = [np.abs(before[key] - after[key]).reshape(len(dataset), -1) for key in _LABELS]
     return int((np.hstack(gaps) > _NOTICEABLE).any(axis=1).sum())
@@ -328,7 +328,7 @@ def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget
     ours = schema.features(dataset.spec)
     others = {key: one for key, one in dataset.stored_features.items() if key not in ours}
     work = partial(render_states, source.env, cameras)
-    return _rewrite(source, target, work, own, schema.features(spec) | others)
+    return rewrite(source, target, work, own, schema.features(spec) | others)
 
 
 def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> Info:
@@ -399,15 +399,26 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
         )
 
 
-def _rewrite(
+def rewrite(
     source: EditSource,
     target: EditTarget,
-    work: Callable[[NDArray[Any]], Columns],
+    work: Callable[[Any], Mapping[str, Any]],
     own: Own,
     features: Features,
+    read: Iterable[Any] = (),
 ) -> Info:
-    """Write `source` with the columns that workers make from each episode's states, (T, m).
-    features: of the target.
+    """Write `source` with the columns that workers make from each episode.
+
+    Args:
+        source: The dataset to edit.
+        target: The new dataset's folder, and how it is written.
+        work: Makes the columns, (T, ...).
+        own: What `meta/manip_il.json` says of the new dataset.
+        features: Of the new dataset.
+        read: What `work` gets of each episode; by default its states, (T, m).
+
+    Returns:
+        The new dataset's `info.json`.
     """
     dataset = source.dataset
 
@@ -421,7 +432,7 @@ def _rewrite(
         for one in dataset.stored_episodes([schema.SIM_STATE])
     )
     about = dataset.fps, dataset.info.robot, own
-    with closing(map_in_order(work, states, target.workers)) as made:
+    with closing(map_in_order(work, read or states, target.workers)) as made:
         return write_episodes(
             episodes(),
             target.root,

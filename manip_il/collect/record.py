@@ -13,7 +13,9 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.edits import EditSource, EditTarget
 from manip_il.collect.job import HOLD, RolloutJob
+from manip_il.collect.language import annotate_dataset
 from manip_il.collect.query import parse_query
 from manip_il.collect.workers import Engine, engine_of
 from manip_il.data.atomic import require_replaceable
@@ -221,6 +223,7 @@ def record(
     seed: int = 0,
     workers: int | Engine | None = 1,
     video: VideoConfig | None = None,
+    language: bool = False,
     resume: bool = False,
     progress: Progress | None = None,
     **options: Any,
@@ -241,6 +244,7 @@ def record(
         seed: 0 to 1000.
         workers: Number of processes, None for one per core; or the engine to use.
         video: How pictures are encoded.
+        language: Whether to add texts that are true of every frame, as `annotate_dataset` does.
         resume: Whether to continue the recording in the folders.
         progress: Follows the recording.
         options: Fields of `RolloutJob`, such as `label` and `cameras`; `round` is by default 1 with
@@ -297,4 +301,7 @@ def record(
             made = collect(engine, job, seeds, journals, progress.episode)
         recording.write(journals)
         recording.make(made, root, replace=resume)
+        if language:
+            target = EditTarget(root, engine.workers or 1, replace=True)
+            annotate_dataset(EditSource(Dataset.open(root), job.env), target)
     return Dataset.open(root)

@@ -42,7 +42,8 @@ from manip_il.learn.lerobot_config import lerobot_options, policy_config, set_fe
 from manip_il.learn.lerobot_policy import build_policy, build_processors, load_processors
 from manip_il.learn.names import OWN_SPACE, PLAIN
 from manip_il.learn.network import threads
-from manip_il.learn.samples import Batch, Samples, load_data, rabc_weights
+from manip_il.learn.paraphrases import rephrased
+from manip_il.learn.samples import TASK, Batch, Samples, load_data, rabc_weights
 from manip_il.learn.sources import (
     check_same_sources,
     check_shares,
@@ -295,7 +296,10 @@ class Trainer:
         """Return this process's samples at a step, as stored."""
         size, place = self.pipeline.batch_size, self.accelerator.process_index
         rows = self.order.batch(step)[place * size : (place + 1) * size]
-        return self.data.batch(self.data.train[rows])
+        batch = self.data.batch(self.data.train[rows])
+        if getattr(self.pipeline.policy, "reads_text", False):
+            batch[TASK] = rephrased(batch[TASK], [self.config.seed, step, place])
+        return batch
 
     def validate(self) -> dict[str, float]:
         """Return the mean loss on samples of held-out episodes, if there are any, without changing

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import NamedTuple, Self
 
 import mujoco
@@ -100,6 +101,10 @@ class Task(ABC):
         shape: The object's, in a task that takes any.
         argument_bodies: Mocap bodies whose places hold the argument of `with_argument`; they stay
             when other places in a scene are drawn anew.
+        nouns: Words for objects and places, by name; by default the name itself.
+        place: Words for where objects are carried.
+        subtasks: Words for phases, by name, in which `{it}` and `{place}` are what is moved and
+            where to; by default those of `SUBTASKS`, or the phase's name and what is moved.
     """
 
     name: str
@@ -113,6 +118,9 @@ class Task(ABC):
     sizes: tuple[float, float] | None = None
     shape: ObjectShape = CUBE
     argument_bodies: tuple[str, ...] = ()
+    nouns: Mapping[str, str] = MappingProxyType({"goal": "green goal"})
+    place: str = "its place"
+    subtasks: Mapping[str, str] = MappingProxyType({})
 
     @abstractmethod
     def build(self, spec: mujoco.MjSpec) -> None:
@@ -158,6 +166,29 @@ class Task(ABC):
         If it varies, a mocap body's pose must encode it.
         """
         return self.instruction
+
+    def noun(self, name: str) -> str:
+        """Return the words for an object or a place of a given name."""
+        return self.nouns.get(name, name.replace("_", " "))
+
+    def moved(self, world: World, phase: str) -> str:
+        """Return the name of what the hand moves or reaches for, or `hand` itself.
+
+        Args:
+            world: The world to look at.
+            phase: Name of the phase that it is in.
+        """
+        return self.objects[0] if self.objects else "hand"
+
+    def subtask(self, world: World, phase: str) -> str:
+        """Return what the expert does in a phase, in words: "carry the cube to the green goal".
+
+        Args:
+            world: The world to look at.
+            phase: Name of the phase that it is in.
+        """
+        words = {**SUBTASKS, **self.subtasks}.get(phase, f"{phase.replace('_', ' ')} {{it}}")
+        return words.format(it=f"the {self.noun(self.moved(world, phase))}", place=self.place)
 
     def unsound(self, world: World) -> str:
         """Return why, even with the objects within reach, there is no sound label.
@@ -205,5 +236,15 @@ def phases(task: Task) -> tuple[str, ...]:
     return (NO_PHASE, *(rung.name for rung in reversed(task.rungs)))
 
 
+_REACH = "reach for {it}"
+SUBTASKS = {
+    "approach": _REACH,
+    "open": _REACH,
+    "descend": _REACH,
+    "carry": "carry {it} to {place}",
+    "at_goal": "hold {it} at {place}",
+    "let_go": "let go of {it}",
+    "done": "move away from {it}",
+}
 CUBE_SIZES = (0.03, 0.07)  # edges of a cube that every gripper goes around [m]
 NO_PHASE = "none"  # the phase of a state without a sound label

@@ -3,6 +3,7 @@
 import math
 from functools import partial
 from itertools import product
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -74,6 +75,9 @@ class ClearTable(Task):
 
     name = "clear_table"
     instruction = "Put all cubes into the box."
+    nouns = MappingProxyType({name: f"{name} cube" for name in COLOURS})
+    place = "the box"
+    subtasks = MappingProxyType({"done": "move away from {place}"})
     tolerance = 0.005
     horizon = 900
     objects = tuple(COLOURS)
@@ -85,6 +89,15 @@ class ClearTable(Task):
         _CARRY,
         *grasp_rungs(current, OVER),
     )
+
+    def moved(self, world: World, phase: str) -> str:
+        """Return the cube in the hand, or the next one.
+
+        Args:
+            world: The world to look at.
+            phase: Name of the phase that it is in.
+        """
+        return nearest_to_hand(world, [*COLOURS]) if phase == "let_go" else current(world)
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the cubes and the box."""

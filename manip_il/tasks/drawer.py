@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -249,11 +250,27 @@ def _move_rungs(name: str, holds: Callable[[World], bool], to: float) -> tuple[R
     )
 
 
+_TO_HANDLE = "reach for the handle"
+
+
 class Drawer(Task):
     """Open a drawer, put a cube in it, close it."""
 
     name = "drawer"
     instruction = "Put the red cube in the drawer and close it."
+    nouns = MappingProxyType({OBJECT: "red cube"})
+    place = "the drawer"
+    subtasks = MappingProxyType(
+        {
+            "to_pull": _TO_HANDLE,
+            "pull": "pull the drawer open",
+            "to_make_way": _TO_HANDLE,
+            "make_way": "push the drawer out of the way",
+            "to_push": _TO_HANDLE,
+            "push": "push the drawer shut",
+            "leave": "move away from the handle",
+        }
+    )
     tolerance = SHUT
     horizon = 500
     objects = (OBJECT,)

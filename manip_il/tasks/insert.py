@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -117,6 +118,14 @@ class Insert(Task):
     name: str = "insert"
     instruction: str = "Put the peg into the hole."
     play: float = 0.002
+    place = "the hole"
+    subtasks = MappingProxyType(
+        {
+            "let_stand": "let {it} stand",
+            "insert": "insert {it} into {place}",
+            "inserted": "hold {it} in {place}",
+        }
+    )
     tolerance = 0.004
     horizon = 600
     objects = (PEG,)

@@ -51,6 +51,7 @@ class PickPlace(Task):
 
     name: str = "pick_place"
     instruction: str = "Pick up the cube and bring it to the green goal."
+    place = "the green goal"
     horizon: int = 100
     objects = (OBJECT,)
     grasped = (OBJECT,)
@@ -65,6 +66,10 @@ class PickPlace(Task):
         return replace(
             self, shape=shape, sizes=shape.sizes, instruction=instruction, horizon=horizon
         )
+
+    def noun(self, name: str) -> str:
+        """Return the words for an object or a place of a given name."""
+        return self.shape.word if name == OBJECT else super().noun(name)
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the object and the goal."""

@@ -1,6 +1,7 @@
 """Press: push a button, which stands anywhere on the table, to its stop."""
 
 import math
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -49,12 +50,18 @@ class Press(Task):
 
     name = "press"
     instruction = "Press the red button."
+    nouns = MappingProxyType({"cap": "red button"})
+    subtasks = MappingProxyType({"pressed": "hold {it} down"})
     tolerance = STOPPED
     rungs = (
         Rung("pressed", lambda w: TRAVEL - pressed(w) < STOPPED, _aim),
         Rung("press", lambda w: _off(w) < OVER, _aim),
         Rung("approach", lambda w: True, _aim),
     )
+
+    def moved(self, world: World, phase: str) -> str:
+        """Return the name of what the hand reaches for: the button's cap."""
+        return "cap"
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the button: a housing, and a cap on a spring."""

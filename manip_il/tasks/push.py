@@ -1,6 +1,7 @@
 """Push: move a puck to a goal on the table without grasping it."""
 
 import math
+from types import MappingProxyType
 from typing import NamedTuple
 
 import mujoco
@@ -137,6 +138,8 @@ class Push(Task):
 
     name = "push"
     instruction = "Push the puck to the green goal."
+    place = "the green goal"
+    subtasks = MappingProxyType({"push": "push {it} to {place}"})
     horizon = 200
     objects = (PUCK,)
     sizes = (0.055, 0.07)

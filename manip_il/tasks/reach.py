@@ -1,6 +1,7 @@
 """Reach: move the hand to a goal in the air."""
 
 import math
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -22,6 +23,8 @@ class ReachGoal(Task):
 
     name = "reach"
     instruction = "Move the hand to the green goal."
+    place = "the green goal"
+    subtasks = MappingProxyType({"carry": "move {it} to {place}"})
     rungs = (
         Rung("at_goal", lambda w: math.dist(w.goal, w.ee.position) < AT_GOAL, _to_goal),
         Rung("carry", lambda w: True, _to_goal),

@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -182,6 +183,8 @@ class Sort(Task):
 
     name = "sort"
     instruction = "Put the cube that is named into the bin of its colour."
+    nouns = MappingProxyType({name: f"{name} cube" for name in COLOURS})
+    place = "the bin of its colour"
     tolerance = 0.005
     horizon = 250
     objects = tuple(COLOURS)
@@ -199,6 +202,15 @@ class Sort(Task):
         """Return the instruction of a world's episode."""
         number = round(float(world.at(ASKED)[2])) % len(SENTENCES)
         return SENTENCES[number].format(colour=asked(world))
+
+    def moved(self, world: World, phase: str) -> str:
+        """Return the named cube, or a wrong one that is put back.
+
+        Args:
+            world: The world to look at.
+            phase: Name of the phase that it is in.
+        """
+        return _other_held(world) or asked(world)
 
     def objects_in(self, world: World) -> tuple[str, ...]:
         """Return the named cube; the others may lie out of reach."""

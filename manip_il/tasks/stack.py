@@ -1,6 +1,7 @@
 """Stack: put one cube on another, where it stands by itself."""
 
 import math
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -75,6 +76,8 @@ class Stack(Task):
 
     name = "stack"
     instruction = "Stack the red cube on the blue cube."
+    nouns = MappingProxyType({TOP: "red cube", BASE: "blue cube"})
+    place = "the blue cube"
     success_steps = 20
     horizon = 400
     objects = (TOP, BASE)

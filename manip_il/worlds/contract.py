@@ -8,6 +8,7 @@ A world gives its environments and experts as these classes say; what it cannot 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, NamedTuple, Protocol
@@ -35,6 +36,7 @@ JOINT_TARGETS = (OPENINGS, SERVOS, TWO_ARMS)
 GRIPPERS = {TWO_ARMS: (6, 13)}
 # version of the columns and their meaning: 2 has progress, complete states and named phases
 VERSION = 2
+UNNAMED = ("none", "act")  # phases of experts that name none
 # keys of a spec's JSON that may be missing
 _OPTIONAL = ("object", "robot_type", "video", "keypoints", "state_names", "expert")
 
@@ -239,6 +241,26 @@ class Environment(Protocol):
         is called `object`.
         """
         ...
+
+    def subtask(self, phase: int) -> str:
+        """Return what the expert does in a phase of the present state, in words; "" if there are
+        none.
+        """
+        name = self.spec.phases[phase]
+        return "" if name in UNNAMED else name.replace("_", " ")
+
+    def noun(self, name: str) -> str:
+        """Return the words for a position or a point of a given name."""
+        return name.replace("_", " ")
+
+    def facts(self) -> list[tuple[str, str, Any]]:
+        """Return what is true of the present state: words for a thing, an attribute, its value."""
+        found = self.positions()
+        hand = found.pop("hand")
+        return [
+            (self.noun(name), "distance to the hand [cm]", round(100 * math.dist(at, hand)))
+            for name, at in found.items()
+        ]
 
     def varied(self, state: State, drawn: Mapping[str, Any]) -> State:
         """Return a state with other values of what `Condition` draws, if the environment can be

@@ -200,6 +200,19 @@ class SeveralEnv(Environment):
         return self.one.positions()
 
     @override
+    def subtask(self, phase: int) -> str:
+        numbers = self._tasks.phases[self._number]
+        return self.one.subtask(numbers.index(phase)) if phase in numbers else ""
+
+    @override
+    def noun(self, name: str) -> str:
+        return self.one.noun(name)
+
+    @override
+    def facts(self) -> list[tuple[str, str, Any]]:
+        return self.one.facts()
+
+    @override
     def varied(self, state: State, drawn: Mapping[str, Any]) -> State:
         inner = self._enter(state)
         return self._tasks.packed(self._number, self.one.varied(inner, drawn))

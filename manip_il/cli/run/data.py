@@ -11,6 +11,7 @@ from pathlib import Path
 from manip_il.bridges.doctor.examine import examine_folder, repair
 from manip_il.bridges.doctor.files import Finding, warning
 from manip_il.cli.data import (
+    AnnotateOptions,
     BuildOptions,
     CheckOptions,
     Edit,
@@ -33,6 +34,7 @@ from manip_il.collect.edits import (
     render_dataset,
 )
 from manip_il.collect.inputs import differences
+from manip_il.collect.language import annotate_dataset
 from manip_il.collect.workers import default_workers
 from manip_il.data.atomic import DATASET, exclusive
 from manip_il.data.build import build, merge_datasets
@@ -102,6 +104,13 @@ def run_relabel(options: RelabelOptions) -> None:
             f"relabelled {info.episodes:,} episodes, {info.frames:,} frames: {changed:,} labels"
             " differ"
         )
+
+
+def run_annotate(options: AnnotateOptions) -> None:
+    """Describe every state; TARGET appears when it is complete."""
+    with _open(options, "annotated") as (source, target):
+        info = annotate_dataset(source, target)
+        say(f"annotated {info.episodes:,} episodes, {info.frames:,} frames")
 
 
 def run_redraw(options: RedrawOptions) -> None:

@@ -34,6 +34,7 @@ def run_record(options: RecordOptions) -> None:
             seed=options.seed,
             workers=engine,
             video=VideoConfig(**options.dataset.rgb_encoder),
+            language=options.language,
             resume=True,
             progress=stages,
             cameras=cameras,

@@ -5,6 +5,7 @@ New scenes from visited states: new goals, and new places of untouched objects.
 Scenes and environments by the names of robot and task.
 """
 
+import colorsys
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
@@ -34,7 +35,7 @@ from manip_il.sim.render import point_names
 from manip_il.sim.scene import Scene, build_scene
 from manip_il.sim.shape import MESH, ObjectShape, stored
 from manip_il.sim.task import Task, phases
-from manip_il.sim.variation import with_drawn
+from manip_il.sim.variation import part, with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks import ENV_IDS
 from manip_il.tasks.table import TASKS, get_task, is_task
@@ -214,6 +215,8 @@ def _contacts(world: World) -> tuple[NDArray[np.int32], F64]:
 
 # control rate for which tasks give their limits [Hz]; at other rates they last as many seconds
 LIMITS_HZ = 20
+_HUES = ("red", "yellow", "green", "cyan", "blue", "magenta")  # a sixth of a turn apart
+_GREYISH = 0.2  # saturation below which a colour has no hue
 # tasks whose furniture older versions rendered without its yaw
 _TURNED = ("carry", "insert", "insert_tight", "press")
 
@@ -274,6 +277,36 @@ class LadderEnv(ManipEnv, Environment):
             is_first = name in self._task.objects_in(world)[:1]
             found["object" if is_first else name] = world.pose(name).position
         return found
+
+    @override
+    def subtask(self, phase: int) -> str:
+        return self._task.subtask(self.world, self.spec.phases[phase]) if phase else ""
+
+    @override
+    def noun(self, name: str) -> str:
+        if name == "object":
+            [name] = self._task.objects_in(self.world)[:1]
+        return self._task.noun(name)
+
+    @override
+    def facts(self) -> list[tuple[str, str, Any]]:
+        found = super().facts()
+        for name, one in self.scene.objects.items():
+            noun = self._task.noun(name)
+            found.append((noun, "state", "held" if self.world.touched(name) else "free"))
+            found.append((noun, "color", self._colour(one.geom)))
+        return found
+
+    def _colour(self, geom: int) -> str:
+        """Return the name of an object's colour in pictures."""
+        model, drawn = self.scene.model, part(self.world.variation, "colour")
+        material = model.geom_matid[geom]
+        own = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+        red, green, blue = own[:3] if (drawn < 0).any() else drawn
+        hue, saturation, value = colorsys.rgb_to_hsv(red, green, blue)
+        if saturation < _GREYISH:
+            return "white" if value > 0.7 else "grey" if value > 0.2 else "black"
+        return _HUES[round(hue * len(_HUES)) % len(_HUES)]
 
     @override
     def varied(self, state: State, drawn: Mapping[str, Any]) -> State:
