@@ -55,6 +55,9 @@ def worker_count(default: int | None = None) -> Any:
     return keyword(default, about, at_least=1, free=True)
 
 
+Published = Literal["smolvla", "pi05", "groot"]  # models that are fine-tuned on datasets
+
+
 @dataclass(frozen=True, kw_only=True)
 class EngineOptions:
     """Options of worker processes on this machine or a Ray cluster."""

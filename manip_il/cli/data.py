@@ -10,7 +10,7 @@ from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 
 from manip_il.checks import parse_yaml, shorten
-from manip_il.cli.common_options import SMALL, OfDataset, Pictured, Varied
+from manip_il.cli.common_options import SMALL, OfDataset, Pictured, Published, Varied
 from manip_il.cli.outputs import Output, Replacing, output_folder
 from manip_il.cli.parsing import Given, given
 from manip_il.errors import UsageError
@@ -180,9 +180,13 @@ class CheckOptions(OfDataset):
     Example: manip-il data check datasets/demos
     """
 
+    model: Published | None = option(
+        None, "also tell what this model would miss if it is fine-tuned on the dataset", flag="for"
+    )
+
 
 @dataclass(frozen=True)
-class RepairOptions(CheckOptions):
+class RepairOptions(OfDataset):
     """Compute a dataset's counts and statistics again if they are wrong.
 
     Replaced files are kept in DATASET.before-repair. Then the dataset is checked again.

@@ -12,7 +12,14 @@ from pathlib import Path
 from typing import ClassVar
 
 from manip_il.algorithms.config import Method, RunConfig
-from manip_il.cli.common_options import SMALL, DatasetRoots, EngineOptions, Trusting, Varied
+from manip_il.cli.common_options import (
+    SMALL,
+    DatasetRoots,
+    EngineOptions,
+    Published,
+    Trusting,
+    Varied,
+)
 from manip_il.cli.outputs import Resumable, ResumableOutput, output_folder
 from manip_il.cli.parsing import Given, given
 from manip_il.data.video_config import VideoConfig
@@ -66,6 +73,9 @@ class DatasetGroup:
     )
     root: Path | None = option(None, "folder of the dataset; by default datasets/NAME", free=True)
     num_episodes: int = option(50, "number of successful episodes", at_least=1, grows=True)
+    shares: list[float] = option(
+        list, "episodes of each of several tasks, relative to the others; by default equally many"
+    )
     rgb_encoder: Given = given(VideoConfig)
 
 
@@ -85,6 +95,9 @@ class RecordOptions(Varied, Seeded, EngineOptions, Resumable):
     )
     env: Given = given(EnvConfig)
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
+    preset: Published | None = option(
+        None, "cameras, pictures, rate and texts as this model wants them for fine-tuning"
+    )
     language: bool = option(
         False, "add texts that are true of every frame, as manip-il data annotate does"
     )

@@ -137,8 +137,9 @@ def demonstrate(
     journals: Path,
     progress: Progress,
     seed: int = 0,
+    shares: Sequence[float] = (),
 ) -> Iterator[tuple[Journal, Episode]]:
-    """Run the expert until it has succeeded in `count` episodes, in equally many of each task.
+    """Run the expert until it has succeeded in `count` episodes.
 
     Args:
         engine: Runs the episodes.
@@ -148,11 +149,13 @@ def demonstrate(
         journals: Folder of the journals.
         progress: Follows the episodes.
         seed: The user's `--seed`.
+        shares: How many episodes each task gets, as in `seeds_by_task`.
 
     Yields:
         What `collect_successes` yields.
     """
-    for seeds, number in seeds_by_task(job.env, stream, count, seed, tries=MAX_TRIES):
+    parts = seeds_by_task(job.env, stream, count, seed, tries=MAX_TRIES, weights=shares)
+    for seeds, number in parts:
         yield from collect_successes(engine, job, seeds, number, journals, progress.episode)
 
 
@@ -177,8 +180,13 @@ def seeds_by_task(
 
     Returns:
         For each task, its seeds and its number of episodes; tasks without episodes are left out.
+
+    Raises:
+        UsageError: if there are not as many weights as tasks.
     """
     tasks = len(task_names(env))
+    if weights and (len(weights) != tasks or min(weights) < 0 or not sum(weights)):
+        raise UsageError(f"shares are {list(weights)}; expected one for each of {tasks} tasks")
     if tasks == 1:
         return [(stream_seeds(stream, tries * count, seed), count)]
     numbers = divide(count, weights or [1.0] * tasks)
@@ -224,6 +232,7 @@ def record(
     workers: int | Engine | None = 1,
     video: VideoConfig | None = None,
     language: bool = False,
+    shares: Sequence[float] = (),
     resume: bool = False,
     progress: Progress | None = None,
     **options: Any,
@@ -245,6 +254,8 @@ def record(
         workers: Number of processes, None for one per core; or the engine to use.
         video: How pictures are encoded.
         language: Whether to add texts that are true of every frame, as `annotate_dataset` does.
+        shares: How many demonstrations each of several tasks gets, relative to the others; by
+            default equally many.
         resume: Whether to continue the recording in the folders.
         progress: Follows the recording.
         options: Fields of `RolloutJob`, such as `label` and `cameras`; `round` is by default 1 with
@@ -295,7 +306,8 @@ def record(
     progress.start(f"record {job.env.robot} {job.env.task}", max(0, episodes - done))
     with engine_of(workers) as engine:
         if policy is None:
-            made = demonstrate(engine, job, "demonstrations", episodes, journals, progress, seed)
+            stream = "demonstrations"
+            made = demonstrate(engine, job, stream, episodes, journals, progress, seed, shares)
         else:
             seeds = stream_seeds(f"round/{job.round}", episodes, seed)
             made = collect(engine, job, seeds, journals, progress.episode)

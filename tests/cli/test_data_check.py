@@ -79,3 +79,21 @@ def test_two_datasets_become_one_with_the_episodes_of_both(root, capsys):
     assert Dataset.open(root.with_name("both")).info.episodes == 4
     assert main(words) == 2
     assert "already exists" in capsys.readouterr().err
+
+
+def test_what_a_published_model_would_miss(root, capsys, tmp_path):
+    edit_json(root / layout.STATS, lambda stats: stats["action"].pop("q99"))
+    run(f"data check {root} --for=pi05")
+    out = capsys.readouterr().out
+    told = ("0 cameras", "action has no quantiles", "2 of the rarest task", "data annotate")
+    assert not [text for text in told if text not in out]
+    made = f"--task.type=reach --dataset.num_episodes=1 --dataset.root={tmp_path / 'fit'}"
+    assert run(f"record --preset=pi05 {made} --image.width=64") == 0
+    dataset = Dataset.open(tmp_path / "fit")
+    assert (dataset.fps, dataset.spec.image_size) == (30, (224, 64))
+    assert dataset.features["language_persistent"].dtype == "language"
+    capsys.readouterr()
+    assert run(f"data check {tmp_path / 'fit'} --for=smolvla") == 0
+    lines = capsys.readouterr().out.splitlines()
+    told = ("camera1, camera2", "224x64", "1 of the rarest task", "whole; warnings: 3")
+    assert [text for text, line in zip(told, lines, strict=True) if text in line] == [*told]

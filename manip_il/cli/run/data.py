@@ -6,10 +6,13 @@ Run `manip-il data check`, `repair`: find errors in a dataset, and repair them.
 
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
-from manip_il.bridges.doctor.examine import examine_folder, repair
+from manip_il.bridges.doctor.examine import Check, examine_folder, repair
 from manip_il.bridges.doctor.files import Finding, warning
+from manip_il.bridges.doctor.models import missing
+from manip_il.cli.common_options import OfDataset
 from manip_il.cli.data import (
     AnnotateOptions,
     BuildOptions,
@@ -140,17 +143,19 @@ def run_check(options: CheckOptions) -> None:
 
     Raises `ManipError` if there are errors.
     """
-    _conclude(options, _examine(options), f"try manip-il data repair {options.dataset}")
+    of_model = [partial(missing, name=options.model)] if options.model else []
+    found = _examine(options, *of_model)
+    _conclude(options, found, f"try manip-il data repair {options.dataset}")
 
 
-def _examine(options: CheckOptions) -> list[Finding]:
+def _examine(options: OfDataset, *more: Check) -> list[Finding]:
     """Check the dataset and print every finding."""
-    findings = examine_folder(options.dataset.absolute(), [check_robot])
+    findings = examine_folder(options.dataset.absolute(), [check_robot, *more])
     say(*map(str, findings))
     return findings
 
 
-def _conclude(options: CheckOptions, findings: list[Finding], remedy: str) -> None:
+def _conclude(options: OfDataset, findings: list[Finding], remedy: str) -> None:
     errors = sum(finding.is_error for finding in findings)
     if errors:
         raise ManipError(

@@ -1,10 +1,13 @@
 """Run `manip-il record`: a dataset of the expert's demonstrations."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from manip_il import checks
+from manip_il.bridges.doctor.models import MODELS
 from manip_il.cli.imitation import RecordOptions
 from manip_il.cli.outputs import locked
+from manip_il.cli.parsing import Given
 from manip_il.cli.progress import Stages, say, say_next
 from manip_il.collect.inputs import env_config
 from manip_il.collect.record import record
@@ -16,6 +19,15 @@ from manip_il.evaluation.suites import varied
 
 def run_record(options: RecordOptions) -> None:
     """Record; the dataset is written while episodes arrive."""
+    if options.preset:
+        model = MODELS[options.preset]
+        options = replace(
+            options,
+            env=Given({"control_hz": model.fps} | options.env),
+            cameras=options.cameras or ["front", "wrist"],
+            image=Given({"height": model.pixels, "width": model.pixels} | options.image),
+            language=True,
+        )
     env = env_config(options.env)
     cameras = options.camera_config(env) if options.cameras else None
     repo_id = checks.repo_id("repo_id", options.dataset.repo_id or f"local/{env.name}")
@@ -35,6 +47,7 @@ def run_record(options: RecordOptions) -> None:
             workers=engine,
             video=VideoConfig(**options.dataset.rgb_encoder),
             language=options.language,
+            shares=options.dataset.shares,
             resume=True,
             progress=stages,
             cameras=cameras,
