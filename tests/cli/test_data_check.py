@@ -88,7 +88,7 @@ def test_what_a_published_model_would_miss(root, capsys, tmp_path):
     told = ("0 cameras", "action has no quantiles", "2 of the rarest task", "data annotate")
     assert not [text for text in told if text not in out]
     made = f"--task.type=reach --dataset.num_episodes=1 --dataset.root={tmp_path / 'fit'}"
-    assert run(f"record --preset=pi05 {made} --image.width=64") == 0
+    assert run(f"record --preset=pi05 {made} --image.width=64 --workers=1") == 0
     dataset = Dataset.open(tmp_path / "fit")
     assert (dataset.fps, dataset.spec.image_size) == (30, (224, 64))
     assert dataset.features["language_persistent"].dtype == "language"
