@@ -38,9 +38,6 @@ class EvalGroup:
         at_least=1,
         grows=True,
     )
-    first: int = option(
-        0, "index of the first seed in the stream, to run a large evaluation in parts", at_least=0
-    )
     hold: int | None = option(
         10,
         "control steps after success until an episode ends; null: it ends at the horizon",
@@ -63,7 +60,7 @@ class EvalOptions(Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
     """Measure a policy's success on unseen seeds; writes eval.json and report.html.
 
     With EVALUATION, an eval.json or its folder, no policy is evaluated: --replay=SEED runs one of
-    its episodes again and films it; two or more, such as parts run on several machines, are merged.
+    its episodes again and films it.
     --check renders a picture and reports whether this machine or container can evaluate.
 
     Example: manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert
@@ -73,8 +70,8 @@ class EvalOptions(Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
         "policy.path policy.type eval.n_episodes suite robot.type task.type output_dir replay"
         " resume"
     )
-    evaluation: list[Path] = option(
-        list, "evaluations: one with --replay, or several to merge", positional=True
+    evaluation: Path | None = option(
+        None, "the evaluation of which --replay runs an episode again", positional=True
     )
     policy: MeasuredPolicyGroup = field(default_factory=MeasuredPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)

@@ -50,7 +50,6 @@ def evaluate(
     kind: str = "expert",
     suite: str = "",
     stream: Literal["test", "validation"] = "test",
-    first: int = 0,
     seed: int = 0,
     hold: int | None = HOLD,
     until_width: float | None = None,
@@ -74,7 +73,6 @@ def evaluate(
         suite: Test conditions, by default nominal; or only their name, if `conditions` is among the
             options.
         stream: Which stream of seeds.
-        first: Index of the first seed in the stream.
         seed: 0 to 1000.
         hold: Control steps after success until an episode ends; None: it ends at the horizon.
         until_width: Stop when the confidence interval is this narrow.
@@ -105,8 +103,8 @@ def evaluate(
         chosen: dict[str, Any] = {"hold": episode_hold(env, hold), "label": "last"}
         job = make_options(RolloutJob, env=env, driver=driver, **chosen | options)
         most = 100 if until_width is None else _MOST_UNTIL_WIDTH
-        count = checks.whole("episodes", most if episodes is None else episodes, 1, BLOCK - first)
-        seeds = stream_seeds(stream, first + count, seed)[first:]
+        count = checks.whole("episodes", most if episodes is None else episodes, 1, BLOCK)
+        seeds = stream_seeds(stream, count, seed)
         name = kind if policy is None else str(getattr(policy, "path", policy))
         progress.started()
         result = measure(

@@ -1,4 +1,4 @@
-"""`eval.json`: one evaluation of one policy; reading, merging and comparing evaluations."""
+"""`eval.json`: one evaluation of one policy; reading and comparing evaluations."""
 
 from __future__ import annotations
 
@@ -194,8 +194,7 @@ class EvalResult:
         seeds = len({episode.seed for episode in self.episodes})
         if seeds != len(self.episodes):
             raise ManipError(
-                f"evaluation of {self.policy}: {len(self.episodes)} episodes on {seeds} seeds; "
-                "every episode needs its own seed; give each part another --eval.first"
+                f"evaluation of {self.policy}: {len(self.episodes)} episodes on {seeds} seeds"
             )
 
     def env(
@@ -365,28 +364,6 @@ class EvalResult:
             raise ManipError(f"{path}: not an {FILE_NAME}: {why}") from error
 
 
-def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
-    """Return all episodes of the parts (name -> part), in the order of their seeds.
-
-    Raises `MismatchError` if policy or environment differ, and `ManipError` for a seed that two
-    parts ran, or for a part whose number of episodes depended on its outcomes.
-    """
-    (first, one), *others = parts.items()
-    for name, other in others:
-        # otherwise only the names show whether the policy is the same
-        known = one.policy_sha256 or other.policy_sha256
-        require_comparable(first, one, name, other, "policy_sha256" if known else "policy")
-    if stopped := next(
-        (name for name, part in parts.items() if part.until_width is not None), None
-    ):
-        raise ManipError(
-            f"{stopped} was stopped by --until_width; merge only parts with a fixed number of"
-            " episodes"
-        )
-    episodes = [episode for part in parts.values() for episode in part.episodes]
-    return replace(one, episodes=tuple(sorted(episodes, key=lambda episode: episode.seed)))
-
-
 def require_equal(left: str, one: object, right: str, other: object, *names: str) -> None:
     """Check that some attributes of two objects are equal.
 
@@ -406,9 +383,7 @@ def require_equal(left: str, one: object, right: str, other: object, *names: str
             raise MismatchError(name, left, ours, right, theirs)
 
 
-def require_comparable(
-    left: str, one: EvalResult, right: str, other: EvalResult, *more: str
-) -> None:
+def require_comparable(left: str, one: EvalResult, right: str, other: EvalResult) -> None:
     """Check that two evaluations agree in robot, task and settings.
 
     Args:
@@ -416,10 +391,9 @@ def require_comparable(
         one: The first evaluation.
         right: Name of the second evaluation, for the message.
         other: The second evaluation.
-        more: Further attributes that must agree; they are compared first.
 
     Raises:
         MismatchError: for the first difference.
     """
-    require_equal(left, one, right, other, *more, "robot", "task")
+    require_equal(left, one, right, other, "robot", "task")
     require_equal(left, one.settings, right, other.settings, *_SETTINGS)

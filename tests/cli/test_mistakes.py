@@ -100,7 +100,7 @@ MISTAKES = {
     "eval": "--policy.path=DIR",
     "eval --policy.path=lerobot/act_aloha": "manip-il pull hf://lerobot/act_aloha FOLDER",
     "eval missing --replay=1": "cannot read missing: No such file or directory; expected an eval.json",
-    "eval SAMPLE": "expected two or more evaluations to merge, or one and --replay=SEED",
+    "eval SAMPLE": "EVALUATION and --replay=SEED belong together",
     f"{EXPERT} --suite=nominall": "did you mean 'nominal'?",
     f"{EXPERT} --until_width=2": "--until_width is 2.0; expected 0.0001 to 1",
     "compare a b": "no policy in a; expected LeRobot's pretrained_model folder",
