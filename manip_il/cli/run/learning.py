@@ -21,10 +21,9 @@ from manip_il.worlds.table import env_spec, stored_config
 
 
 def _run(options: Learning, config: LearningConfig) -> None:
-    """Run all iterations, or continue them, and write the report."""
+    """Run all iterations, and write the report."""
     with options.open() as folder:
-        kept = f"every finished iteration, in {folder}"
-        with Stages(kept) as stages, options.open_engine() as engine:
+        with Stages() as stages, options.open_engine() as engine:
             stages.start(f"{options.method.upper()}, steps", config.steps)
             for result in LearningRun(config, folder, engine).results():
                 stages.log({"step": result.steps} | result.metrics)
