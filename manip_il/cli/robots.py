@@ -27,9 +27,8 @@ class WatchedPolicyGroup:
     """`--policy.*`: the policy that drives."""
 
     path: Path | None = option(None, "a checkpoint or a run")
-    type: Literal["expert", "random", "sliders"] | None = option(
-        None,
-        "who drives instead of a checkpoint, by default the expert; sliders: you, in the window",
+    type: Literal["expert", "random"] | None = option(
+        None, "who drives instead of a checkpoint, by default the expert"
     )
 
 

@@ -1,16 +1,12 @@
-"""Show running episodes in a window, whose sliders may drive the robot, or in Rerun, live or
-through a file.
-"""
+"""Show running episodes in a window, or in Rerun, live or through a file."""
 
 import socket
-from collections.abc import Sequence
 from pathlib import Path
 
 import rerun
 
-from manip_il.collect.rollout import Act, Turn
 from manip_il.data import schema
-from manip_il.mdp import F64, Actor, Transition
+from manip_il.mdp import Transition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import phases
 from manip_il.sim.view import Clock, Window
@@ -28,16 +24,14 @@ class WindowScreen:
 
     Args:
         env: The environment.
-        sliders: Whether the viewer's control sliders drive the robot.
 
     Raises:
         RenderError: if there is no display.
     """
 
-    def __init__(self, env: ManipEnv, *, sliders: bool = False):
+    def __init__(self, env: ManipEnv):
         self._env, self._phases = env, phases(env.scene.task)
-        self._window = Window(env.scene, env.config.control_hz, sliders=sliders)
-        self.act = slider_actions(self._window, env) if sliders else None
+        self._window = Window(env.scene, env.config.control_hz)
 
     def add(self, step: Transition) -> bool:
         """Show the world after a step, in real time; return False once the window is closed."""
@@ -54,23 +48,6 @@ class WindowScreen:
     def close(self) -> None:
         """Close the window."""
         self._window.close()
-
-
-def slider_actions(window: Window, env: ManipEnv) -> Act:
-    """Return a driver whose action (n,) is read from a window's control sliders: joint targets and
-    gripper command.
-
-    In the first step of an episode, the action is the environment's initial controls.
-    """
-
-    def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        scene, before = env.scene, env.data.ctrl
-        [turn] = turns
-        commands = before if turn.step == 0 else window.commands
-        opening = scene.gripper.commanded(commands[scene.gripper.ctrl], before[scene.gripper.ctrl])
-        return [(scene.actions.join(commands[scene.arm_ctrl], opening), Actor.LEARNER)]
-
-    return act
 
 
 def outcome(step: Transition) -> str:
@@ -95,8 +72,6 @@ class RerunLog:
     Raises:
         OSError: if the file cannot be written.
     """
-
-    act = None  # a log does not drive the robot
 
     def __init__(self, env: EnvConfig, output: Path | None = None):
         if output:

@@ -125,7 +125,7 @@ MISTAKES = {
     "data redraw SAMPLE SAMPLE --overwrite=true": "overlaps",
     "push SAMPLE": "REMOTE is missing",
     "push missing hf://me/x": "missing is neither a LeRobot dataset",
-    "view --policy.type=slider": "--policy.type: expected expert|random|sliders, got 'slider'",
+    "view --policy.type=slider": "--policy.type: expected expert|random, got 'slider'",
     "robot new missing.xml": "missing.xml: No such file or directory; expected an MJCF",
     "robot certify --cases=2000000": "--cases is 2000000; expected 1 to 1,000,000",
     "theory missing": "a run of manip-il dagger",
