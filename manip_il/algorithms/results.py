@@ -11,11 +11,9 @@ from manip_il.data.atomic import read_lines
 from manip_il.errors import ManipError
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.eval_report import run_report
-from manip_il.evaluation.report import Report
+from manip_il.evaluation.report import CLONING, DAGGER, Report
 from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.evaluation.rounds import METRICS_FILE, history
-from manip_il.evaluation.side import Member, Side
-from manip_il.evaluation.tables import CLONING, DAGGER
+from manip_il.evaluation.side import METRICS_FILE, Member, Side, history
 
 STAGES = ("collect", "fit", "validate")
 VALIDATION = "validation"

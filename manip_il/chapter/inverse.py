@@ -19,9 +19,16 @@ from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError
-from manip_il.evaluation.figures import CLONING, DAGGER, Figure, drawing, to_figure
-from manip_il.evaluation.report import Report, Section
-from manip_il.evaluation.tables import Table
+from manip_il.evaluation.report import (
+    CLONING,
+    DAGGER,
+    Figure,
+    Report,
+    Section,
+    Table,
+    drawing,
+    to_figure,
+)
 from manip_il.mdp import F64, I64
 from manip_il.robots.table import get_robot
 from manip_il.tasks.carry.grid import (

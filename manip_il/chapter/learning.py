@@ -42,7 +42,7 @@ from manip_il.collect.job import HOLD, RolloutJob
 from manip_il.data.atomic import new_folder
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.evaluation.rounds import METRICS_FILE
+from manip_il.evaluation.side import METRICS_FILE
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.network import threads
 from manip_il.learn.training_state import PRETRAINED_MODEL

@@ -47,7 +47,7 @@ COMMANDS = {
     "serve": ("robots:ServeOptions:serve", "run a virtual SO-101 for LeRobot's own programs"),
     "push": ("transfer:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
     "pull": ("transfer:PullOptions", "download a dataset or policy and verify every file"),
-    "export": ("transfer:ExportOptions:export", "export a policy as ONNX"),
+    "export": ("transfer:ExportOptions:train", "export a policy as ONNX"),
     "theory": (
         "chapter:TheoryOptions",
         "compare the proven bounds of cloning and DAgger with a run",

@@ -26,8 +26,7 @@ from manip_il.errors import MismatchError, UsageError
 from manip_il.option import keyword, option
 
 if TYPE_CHECKING:
-    from manip_il.evaluation.report import Report
-    from manip_il.evaluation.tables import Table
+    from manip_il.evaluation.report import Report, Table
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,10 +18,9 @@ from manip_il.evaluation.intervals import (
     mean_interval,
     sign_flip_exact,
 )
+from manip_il.evaluation.report import Table
 from manip_il.evaluation.results import require_comparable
-from manip_il.evaluation.rounds import Cost, Round, Rule, costs_of
-from manip_il.evaluation.side import Side
-from manip_il.evaluation.tables import Table
+from manip_il.evaluation.side import Cost, Round, Rule, Side, costs_of
 
 FILE_NAME = "compare.json"
 

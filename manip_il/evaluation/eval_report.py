@@ -3,18 +3,34 @@ films.
 """
 
 import itertools
+import textwrap
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from manip_il.errors import printable
 from manip_il.evaluation.comparison import Study
-from manip_il.evaluation.figures import COLOURS, curve_figures
-from manip_il.evaluation.report import Film, Report, Section
+from manip_il.evaluation.intervals import format_percent
+from manip_il.evaluation.report import (
+    BASELINE,
+    COLOURS,
+    INK,
+    INTERVAL,
+    Figure,
+    Film,
+    Report,
+    Section,
+    Table,
+    drawing,
+    to_figure,
+)
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.side import Side
-from manip_il.evaluation.tables import BASELINE, INTERVAL, Table
+from manip_il.evaluation.side import Side, costs_of
 from manip_il.worlds.table import world_of
+
+_MARKERS = ("o-", "s-", "D-", "^-")  # distinguishable without colour
+_PANEL = (4.4, 3.0)  # size of a figure placed beside others [inches]
 
 
 def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = "") -> Report:
@@ -177,3 +193,44 @@ def success_table(sides: Sequence[Side]) -> Table:
         "steps to success",
     )
     return Table((*head, "success, disturbed"), tuple(rows), tuple(side.colour for side in sides))
+
+
+def curve_figures(sides: Sequence[Side], target: float | None = None) -> tuple[Figure, ...]:
+    """Draw the validation success of each run of the sides against every cost, one figure each.
+
+    Args:
+        sides: The sides.
+        target: Success that is drawn as a horizontal line, in [0, 1].
+    """
+    figures: list[Figure] = []
+    for cost in costs_of(run for side in sides for run in side.histories):
+        with drawing(1, size=_PANEL) as (drawn, axes):
+            axis = axes[0, 0]
+            for place, side in enumerate(sides):
+                label = printable(textwrap.shorten(side.name, 40)).replace("$", r"\$")
+                for run in side.histories:
+                    rates = [100 * one.validation.rate for one in run]
+                    axis.plot(
+                        [one.amount(cost) for one in run],
+                        rates,
+                        _MARKERS[place % 4],
+                        c=side.colour,
+                        label=label,
+                    )
+                    label = ""  # one entry per side in the legend
+            if target is not None:
+                axis.axhline(
+                    100 * target,
+                    color=INK,
+                    ls="--",
+                    lw=1,
+                    label=f"target, {format_percent(target)}",
+                )
+            axis.set(xlabel=cost, ylim=(-2, 102), ylabel="validation success [%]")
+            drawn.legend(loc="outside upper left", ncols=2)
+            figures.append(
+                to_figure(
+                    drawn, f"Validation success over {cost}: {', '.join(one.name for one in sides)}"
+                )
+            )
+    return tuple(figures)

@@ -8,8 +8,8 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.errors import UsageError
+from manip_il.evaluation.measuring import EPISODES_FILE as KEPT
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.runner import EPISODES_FILE as KEPT
 from manip_il.evaluation.suites import CONDITIONS, SUITES, suite_conditions
 from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.sim.events import STANDARD

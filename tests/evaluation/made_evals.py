@@ -9,8 +9,7 @@ from manip_il.evaluation.comparison import Study
 from manip_il.evaluation.film import encode_mp4
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
-from manip_il.evaluation.rounds import Rule, history
-from manip_il.evaluation.side import Member, Side
+from manip_il.evaluation.side import Member, Rule, Side, history
 
 from .test_rounds import records
 

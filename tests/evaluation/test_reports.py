@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.evaluation.eval_report import compare_report, eval_report, run_report
-from manip_il.evaluation.figures import curve_figures
+from manip_il.evaluation.eval_report import compare_report, curve_figures, eval_report, run_report
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.side import Member, Side
 

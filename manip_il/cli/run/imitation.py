@@ -31,12 +31,11 @@ from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.evaluation.comparison import FILE_NAME, Comparison, Study
 from manip_il.evaluation.eval_report import compare_report, run_report, success_table
 from manip_il.evaluation.film import collect_films, film_episode, run_states
-from manip_il.evaluation.measuring import measure_sides, open_driver
-from manip_il.evaluation.report import REPORT_FILE, Film
-from manip_il.evaluation.rounds import Rule
-from manip_il.evaluation.runner import episode_hold
+from manip_il.evaluation.measuring import episode_hold, measure_sides, open_driver
+from manip_il.evaluation.report import CLONING, DAGGER, EXPERT, REPORT_FILE, Film
 from manip_il.evaluation.side import (
     Member,
+    Rule,
     Side,
     read_member,
     read_side,
@@ -45,7 +44,6 @@ from manip_il.evaluation.side import (
     select_rounds,
 )
 from manip_il.evaluation.suites import varied
-from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
 from manip_il.learn.checkpoint import Checkpoint, policy_folder
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import MLP
