@@ -3,7 +3,7 @@ import pickle
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.cli.progress import say, warn
+from manip_il.cli.outputs import say, warn
 from manip_il.errors import UnknownName, nearest, shorten
 from manip_il.evaluation.report import Table
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from manip_il import __version__
 from manip_il.bridges.store.errors import redact
-from manip_il.cli import progress
+from manip_il.cli import outputs
 from manip_il.cli.parsing import Option, metavar, options_of, parse, word
 from manip_il.errors import ManipError, UnknownName, printable, silence_ffmpeg_warning, told
 
@@ -124,8 +124,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # the words after `--` are another program's
     end = given.index("--") if "--" in given else len(given)
     own = [word for word in given[:end] if word not in ("--debug", "--quiet")]
-    progress.set_quiet("--quiet" in given[:end])
-    logging.getLogger("manip_il").handlers = [progress.Warnings()]
+    outputs.set_quiet("--quiet" in given[:end])
+    logging.getLogger("manip_il").handlers = [outputs.Warnings()]
     try:
         _dispatch(own, given[end:])
     except (Exception, KeyboardInterrupt) as error:

@@ -42,8 +42,7 @@ from manip_il.cli.chapter import (
     TheoryOptions,
 )
 from manip_il.cli.data import ScoreOptions
-from manip_il.cli.outputs import publish
-from manip_il.cli.progress import progress, say
+from manip_il.cli.outputs import progress, publish, say
 from manip_il.data.atomic import write_file, write_json
 from manip_il.data.dataset import Dataset
 from manip_il.evaluation.certify import certify, count_episodes

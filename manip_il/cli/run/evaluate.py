@@ -5,8 +5,7 @@ import tempfile
 from pathlib import Path
 
 from manip_il.cli.evaluate import EvalOptions
-from manip_il.cli.outputs import OutputFile, about
-from manip_il.cli.progress import Stages, say, say_next
+from manip_il.cli.outputs import OutputFile, Stages, about, say, say_next
 from manip_il.collect.inputs import path_options
 from manip_il.collect.workers import default_workers
 from manip_il.data.atomic import write_file

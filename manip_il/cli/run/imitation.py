@@ -19,9 +19,8 @@ from manip_il.algorithms.run import Run
 from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.evaluate import CompareOptions, ComparisonOptions, StudyFile
 from manip_il.cli.imitation import DaggerOptions, DemoOptions
-from manip_il.cli.outputs import about, publish
+from manip_il.cli.outputs import Stages, about, publish, say, say_next, warn
 from manip_il.cli.parsing import Open, from_layers, from_yaml
-from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.collect.inputs import env_config, path_options
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import parse_query

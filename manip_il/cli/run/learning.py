@@ -10,8 +10,7 @@ from manip_il.chapter.config import LearningConfig
 from manip_il.chapter.learning import LearningRun
 from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.chapter import GailOptions, Learning, PpoOptions
-from manip_il.cli.outputs import about
-from manip_il.cli.progress import Stages, say
+from manip_il.cli.outputs import Stages, about, say
 from manip_il.cli.run.imitation import say_best
 from manip_il.collect.inputs import open_dataset
 from manip_il.learn.checkpoint import Origin, find_policy

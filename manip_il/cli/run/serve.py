@@ -3,8 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from manip_il.cli.outputs import save_options
-from manip_il.cli.progress import say
+from manip_il.cli.outputs import save_options, say
 from manip_il.cli.robots import ServeOptions
 from manip_il.data.atomic import exclusive, output_of, require_ours
 from manip_il.errors import UsageError

@@ -7,7 +7,7 @@ import contextlib
 import os
 
 from manip_il.cli.imitation import RANK, TrainOptions
-from manip_il.cli.progress import Stages, say, say_next, set_quiet
+from manip_il.cli.outputs import Stages, say, say_next, set_quiet
 from manip_il.cli.transfer import ExportOptions
 from manip_il.collect.inputs import open_dataset, own_files, why_not_simulated
 from manip_il.data.atomic import write_file

@@ -3,7 +3,7 @@
 from rich import filesize
 
 from manip_il.bridges.store.transfer import open_remote, pull, push
-from manip_il.cli.progress import has_bars, say, say_next
+from manip_il.cli.outputs import has_bars, say, say_next
 from manip_il.cli.transfer import (
     PullOptions,
     PushOptions,

@@ -7,7 +7,7 @@ import socket
 from typing import Any
 
 from manip_il.cli.common_options import default_cameras
-from manip_il.cli.progress import say
+from manip_il.cli.outputs import say
 from manip_il.cli.robots import IN_A_FILE, ViewOptions
 from manip_il.collect.job import HOLD, RolloutJob, observed_cameras, run_steps
 from manip_il.evaluation.measuring import open_driver
