@@ -55,14 +55,13 @@ class ViewOptions(Tested, Seeded, Trusting):
 
 
 @dataclass(frozen=True)
-class ServeOptions(Varied, Trusting):
+class ServeOptions(Varied):
     """Run a simulated SO-101 behind serial ports, which LeRobot's own programs open like those of a
     real arm.
 
     Prints both ports, the cameras, and a command line to copy. With `-- COMMAND ...` it runs that
     program on the ports and presses its keys as a person would: an episode ends when the task is
-    solved, and a failed one is recorded again. --vary=servo also varies the servos. A policy as the
-    leader (--leader=runs/lift) sets the default task and cameras.
+    solved, and a failed one is recorded again. --vary=servo also varies the servos.
 
     Example: manip-il serve --task.type=lift --cameras=front,wrist
     """
