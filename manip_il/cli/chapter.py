@@ -139,7 +139,6 @@ class Learning(EngineOptions, Output):
     """What `rl gail`, `rl airl` and `rl ppo` share: options, run, progress and report."""
 
     method: ClassVar[str]
-    first: ClassVar[str] = "dataset.root init steps reward validation_episodes output_dir"
     init: Path | None = option(
         None, "a cloned mlp (a checkpoint or a run) to start from; by default a new policy"
     )

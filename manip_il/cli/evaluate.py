@@ -9,7 +9,7 @@ seeds.
 
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting
 from manip_il.cli.outputs import ResumableOutput, output_folder
@@ -66,10 +66,6 @@ class EvalOptions(Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
     Example: manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert
     """
 
-    first: ClassVar[str] = (
-        "policy.path policy.type eval.n_episodes suite robot.type task.type output_dir replay"
-        " resume"
-    )
     evaluation: Path | None = option(
         None, "the evaluation of which --replay runs an episode again", positional=True
     )
@@ -151,7 +147,6 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting, EngineOptions,
     Example: manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare
     """
 
-    first: ClassVar[str] = "at eval.n_episodes suite output_dir resume training_seeds"
     sides: list[Path] = option(
         MISSING,
         "two sides, each an eval.json, a policy or a run; or the YAML file of a study",

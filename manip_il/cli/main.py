@@ -109,7 +109,7 @@ GROUPS = {
     "rl": "reinforcement learning: GAIL, AIRL, PPO",
     "reward": "learn rewards from demonstrations or preferences",
 }
-HELP = ("--help", "-h", "--help=all")
+HELP = ("--help", "-h")
 _GLOBAL_HELP = """\
   --debug      show the traceback of an error
   --quiet      show no progress on standard error"""
@@ -162,7 +162,7 @@ def _dispatch(own: list[str], others: list[str]) -> None:
     elif {*HELP} & {*words}:
         print(_command_help(name, load(name), words))
     else:
-        options = parse(load(name), [*words, *others], command=name)
+        options = parse(load(name), [*words, *others])
         silence_ffmpeg_warning()
         run(name, options)
 
@@ -211,21 +211,17 @@ def _help(group: str = "") -> str:
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
-    """Return the help of one command: its most used options (`first`), or all with `--help=all`.
+    """Return the help of one command.
 
     words: the command line; with `--policy.type=act` the options of that policy are listed, too.
     """
     options = options_of(cls)
-    first = () if "--help=all" in words else getattr(cls, "first", "").split()
     positional = [option for option in options if option.positional]
     places = "".join(
         f" {one.label}" if one.default is MISSING else f" [{one.label}]" for one in positional
     )
-    rows = dict(_row(one) for one in options if not first or one.positional or one.name in first)
-    rest = len(options) - len(rows)
+    rows = dict(map(_row, options))
     rows["--config_path=FILE.yaml"] = "read options from YAML; the command line overrides them"
-    if rest:
-        rows["--help=all"] = f"also list the other {rest} options"
     kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
     more = ""
     if kind and any(one.is_open for one in options):

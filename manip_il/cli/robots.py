@@ -9,7 +9,7 @@ expert can do.
 
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting, Varied
 from manip_il.cli.outputs import Output, Replacing, output_folder
@@ -45,7 +45,6 @@ class ViewOptions(Tested, Seeded, Trusting):
     Example: manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd
     """
 
-    first: ClassVar[str] = "policy.path policy.type robot.type task.type n_episodes output"
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
     n_episodes: int | None = option(
@@ -66,7 +65,6 @@ class ServeOptions(Varied):
     Example: manip-il serve --task.type=lift --cameras=front,wrist
     """
 
-    first: ClassVar[str] = "task.type cameras leader servo log output_dir"
     command: list[str] = option(
         list, "a LeRobot program and its options, after `--`", positional=True
     )
@@ -126,7 +124,6 @@ class CertifyOptions(Seeded, EngineOptions, Output):
     Example: manip-il robot certify --task.type=stack --output_dir=runs/certificate
     """
 
-    first: ClassVar[str] = "robot.type task.type cases output_dir"
     env: Given = given(EnvConfig)
     cases: int = option(
         500, "episodes for each kind of perturbation", at_least=1, at_most=1_000_000
