@@ -43,7 +43,7 @@ COMMANDS = {
         "evaluate:CompareOptions:imitation",
         "compare policies, runs or whole studies on the same seeds",
     ),
-    "view": ("robots:ViewOptions:view", "watch a robot at its task, in a window or a browser"),
+    "view": ("robots:ViewOptions:view", "watch a robot at its task, in a window or from a file"),
     "serve": ("robots:ServeOptions:serve", "run a virtual SO-101 for LeRobot's own programs"),
     "push": ("transfer:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
     "pull": ("transfer:PullOptions", "download a dataset or policy and verify every file"),

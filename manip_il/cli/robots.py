@@ -1,5 +1,4 @@
-"""`manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun if there is no
-display.
+"""`manip-il view`: a robot at its task, live in MuJoCo's viewer, or in a file of Rerun's.
 
 `manip-il serve`: a virtual SO-101 behind serial ports, for LeRobot's own programs.
 
@@ -34,13 +33,12 @@ class WatchedPolicyGroup:
 
 @dataclass(frozen=True)
 class ViewOptions(Tested, Seeded, Trusting):
-    """Watch a robot at its task in MuJoCo's viewer.
+    """Watch a robot at its task in MuJoCo's viewer, or write what happens to a file of Rerun's.
 
-    Without a display, in a browser (Rerun) or from a file.
-
-    Episodes run in real time until --n_episodes have ended, the window is closed or Ctrl-C is
-    pressed. The browser shows pictures, joints, actions, phase and progress. --output writes these
-    as fast as possible to a file, which `rerun FILE.rrd` opens on any machine.
+    In the viewer, episodes run in real time until --n_episodes have ended, the window is closed or
+    Ctrl-C is pressed. --output writes pictures, joints, actions, phase and progress as fast as
+    possible to a file, which `rerun FILE.rrd` opens on any machine, and `rerun --web-viewer
+    FILE.rrd` in a browser.
 
     Example: manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd
     """

@@ -60,6 +60,7 @@ def test_a_file_holds_every_step_and_a_picture_of_every_camera(tmp_path, capsys)
         f"seed 3000000: solved, {steps[0]} steps",
         f"seed 3000001: solved, {steps[1]} steps",
         f"next: rerun {path}",
+        f"in a browser: rerun --web-viewer {path}",
     ]
     for name in (schema.STATE, schema.ACTION, schema.EXECUTED_ACTION):
         recorded = np.concatenate([episode.columns[name] for episode in episodes])
