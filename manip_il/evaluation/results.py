@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -247,27 +247,22 @@ class EvalResult:
 
         "" for episodes without a condition.
         """
-        parts: dict[str, list[EpisodeResult]] = {
-            condition.name: [] for condition in self.settings.conditions
-        }
-        for episode in self.episodes:
-            parts.setdefault(episode.condition, []).append(episode)
-        return {
-            name: replace(self, episodes=tuple(episodes))
-            for name, episodes in parts.items()
-            if episodes
-        }
+        return self._split("condition", [one.name for one in self.settings.conditions])
 
     @cached_property
     def by_task(self) -> dict[str, EvalResult]:
         """Task -> its episodes; {} if there is only one task."""
-        parts: dict[str, list[EpisodeResult]] = {}
+        return {name: part for name, part in sorted(self._split("task").items()) if name}
+
+    def _split(self, key: str, first: Sequence[str] = ()) -> dict[str, EvalResult]:
+        """The episodes by a value in their details, those of the values in `first` first."""
+        parts: dict[str, list[EpisodeResult]] = {name: [] for name in first}
         for episode in self.episodes:
-            parts.setdefault(episode.detail.get("task", ""), []).append(episode)
+            parts.setdefault(episode.detail.get(key, ""), []).append(episode)
         return {
             name: replace(self, episodes=tuple(episodes))
-            for name, episodes in sorted(parts.items())
-            if name
+            for name, episodes in parts.items()
+            if episodes
         }
 
     @property
