@@ -2,18 +2,15 @@
 films.
 """
 
-import itertools
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from manip_il.errors import printable
 from manip_il.evaluation.comparison import Study
 from manip_il.evaluation.intervals import format_percent
 from manip_il.evaluation.report import (
-    BASELINE,
     COLOURS,
     INK,
     INTERVAL,
@@ -73,9 +70,7 @@ def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = 
 
 def compare_report(study: Study, title: str) -> Report:
     """Return the report of a comparison of sides."""
-    others = [side.name for side in study.sides if side.name != study.baseline]
-    colours = dict(zip(others, itertools.cycle(COLOURS), strict=False))
-    sides = [replace(side, colour=colours.get(side.name, BASELINE)) for side in study.sides]
+    sides = study.sides
     first = sides[0].results[0]
     note = (
         f"Every policy ran {first.success.n:,} test episodes on the same seeds, which selected no"
@@ -87,7 +82,7 @@ def compare_report(study: Study, title: str) -> Report:
     return run_report(
         sides,
         [side for side in sides if side.histories],
-        table=replace(study.table(), colours=tuple(side.colour for side in sides)),
+        table=study.table(),
         note=note,
         failed=[] if study.baseline is None else sides,
         target=study.target,
@@ -161,7 +156,7 @@ def condition_sides(result: EvalResult) -> list[Side]:
         return [Side.of(result.policy, result)]
     parts = [Side.of(name, part) for name, part in named.items()]
     whole = "all conditions" if conditions else "all tasks"
-    return [Side.of(whole, result, colour=BASELINE), *parts]
+    return [Side.of(whole, result), *parts]
 
 
 def success_table(sides: Sequence[Side]) -> Table:
@@ -192,7 +187,7 @@ def success_table(sides: Sequence[Side]) -> Table:
         "success at end",
         "steps to success",
     )
-    return Table((*head, "success, disturbed"), tuple(rows), tuple(side.colour for side in sides))
+    return Table((*head, "success, disturbed"), tuple(rows))
 
 
 def curve_figures(sides: Sequence[Side], target: float | None = None) -> tuple[Figure, ...]:
@@ -214,7 +209,7 @@ def curve_figures(sides: Sequence[Side], target: float | None = None) -> tuple[F
                         [one.amount(cost) for one in run],
                         rates,
                         _MARKERS[place % 4],
-                        c=side.colour,
+                        c=COLOURS[place % len(COLOURS)],
                         label=label,
                     )
                     label = ""  # one entry per side in the legend

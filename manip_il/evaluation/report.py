@@ -30,13 +30,11 @@ INTERVAL = "[95 % interval]"  # part of a column's header; see `CONFIDENCE`
 # after Okabe and Ito's palette, distinguishable with every kind of colour blindness
 DAGGER = "#0072b2"
 CLONING = "#d55e00"
-EXPERT = "#00835f"
-BASELINE = "#868e98"
 _PLAIN_WIDTH = 240  # files and pipes have no width to wrap lines at
 INK = "#1d2126"
 SOFT = "#5b636d"
 RULE = "#e3e5e8"
-COLOURS = (DAGGER, CLONING, EXPERT, "#a6408a", "#9a6f00", "#2f8fc4", "#7a4a2b")
+COLOURS = (DAGGER, CLONING, "#00835f", "#a6408a", "#9a6f00", "#2f8fc4", "#7a4a2b")
 _DPI = 96
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",  # looks the same whatever fonts a machine has
@@ -102,18 +100,16 @@ class Table:
     Attributes:
         columns: The headers; the first column names the row.
         rows: The cells of each row, as many as there are columns.
-        colours: One per row, such as `#0072b2`; empty for none.
     """
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    colours: tuple[str, ...] = ()
 
     def filled(self) -> Table:
         """Return the table without its empty columns."""
         keep = [i for i in range(len(self.columns)) if i == 0 or any(row[i] for row in self.rows)]
         rows = tuple(tuple(row[i] for i in keep) for row in self.rows)
-        return Table(tuple(self.columns[i] for i in keep), rows, self.colours)
+        return Table(tuple(self.columns[i] for i in keep), rows)
 
     def print(self) -> None:
         """Print the non-empty columns as plain text."""

@@ -15,8 +15,6 @@ from manip_il.collect.workers import Engine
 from manip_il.errors import RenderError, UsageError
 from manip_il.evaluation.measuring import measure
 from manip_il.evaluation.report import (
-    CLONING,
-    EXPERT,
     INK,
     INTERVAL,
     Figure,
@@ -238,7 +236,7 @@ def task_table(check: RobotCheck) -> Table:
         )
         for task in check.tasks
     )
-    return Table(columns, rows, tuple(EXPERT if task.done else CLONING for task in check.tasks))
+    return Table(columns, rows)
 
 
 def _reach_figure(robot: Robot) -> Figure:

@@ -16,7 +16,6 @@ from typing import Any, Literal
 from manip_il.data.atomic import read_lines
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.intervals import Proportion
-from manip_il.evaluation.report import DAGGER
 from manip_il.evaluation.results import FILE_NAME, EvalResult, require_equal
 from manip_il.learn.checkpoint import find_policy
 from manip_il.worlds.config import EnvConfig
@@ -267,14 +266,12 @@ class Side:
     Attributes:
         name: Name of the side.
         members: The policies, one per training seed.
-        colour: Colour in reports, such as `#0072b2`.
         labels: Number of expert labels that a policy learnt from, if known.
         disturbed: The policy's evaluation under a disturbance, if any.
     """
 
     name: str
     members: tuple[Member, ...]
-    colour: str = DAGGER
     labels: int | None = None
     disturbed: EvalResult | None = None
 

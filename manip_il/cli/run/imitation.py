@@ -31,7 +31,7 @@ from manip_il.evaluation.comparison import FILE_NAME, Comparison, Study
 from manip_il.evaluation.eval_report import compare_report, run_report, success_table
 from manip_il.evaluation.film import collect_films, film_episode, run_states
 from manip_il.evaluation.measuring import episode_hold, measure_sides, open_driver
-from manip_il.evaluation.report import CLONING, DAGGER, EXPERT, REPORT_FILE, Film
+from manip_il.evaluation.report import REPORT_FILE, Film
 from manip_il.evaluation.side import (
     Member,
     Rule,
@@ -183,15 +183,12 @@ def _measure(
     more = run.demonstrations(math.ceil(ENOUGH * config.demonstrations * most / first.labels))
     policy = run.fit([more]).path
     contestants = (
-        ("expert", None, None, EXPERT),
-        ("cloning", first.policy, first.labels, CLONING),
-        ("cloning with as many labels", policy, more.labels, CLONING),
-        (f"DAgger (round {best.number})", best.policy, best.labels, DAGGER),
+        ("expert", None, None),
+        ("cloning", first.policy, first.labels),
+        ("cloning with as many labels", policy, more.labels),
+        (f"DAgger (round {best.number})", best.policy, best.labels),
     )
-    sides = [
-        Side(name, (Member(Path(name), policy=path),), colour, n)
-        for name, path, n, colour in contestants
-    ]
+    sides = [Side(name, (Member(Path(name), policy=path),), n) for name, path, n in contestants]
     envs = dict.fromkeys((side.name for side in sides), config.env)
     nominal, disturbed = (
         measure_sides(
