@@ -30,13 +30,12 @@ _MARKERS = ("o-", "s-", "D-", "^-")  # distinguishable without colour
 _PANEL = (4.4, 3.0)  # size of a figure placed beside others [inches]
 
 
-def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = "") -> Report:
+def eval_report(result: EvalResult, films: Sequence[Film] = ()) -> Report:
     """Return the report of an evaluation.
 
     Args:
         result: The evaluation.
         films: The films to show.
-        no_films: Why there are no films; empty if there are films, or none were asked for.
     """
     settings, success = result.settings, result.success
     solved = world_of(result.robot, result.task).success(settings.tolerance, settings.success_steps)
@@ -60,7 +59,6 @@ def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = 
     return run_report(
         condition_sides(result),
         films=films,
-        no_films=no_films,
         note=note,
         failed=[Side.of("failed episodes", result)],
         title=f"Evaluation of {result.policy}: {result.robot} {result.task}",
@@ -96,7 +94,6 @@ def run_report(
     sides: Sequence[Side],
     runs: Sequence[Side] = (),
     films: Sequence[Film] = (),
-    no_films: str = "",
     *,
     table: Table | None = None,
     note: str = "",
@@ -110,7 +107,6 @@ def run_report(
         sides: Measured sides; the conditions of a disturbed one are named.
         runs: Sides whose rounds are drawn as curves.
         films: Films of episodes.
-        no_films: Why there are no films, or empty.
         table: Table of the results, by default that of `success_table`.
         note: A paragraph below the table.
         failed: Sides whose failed episodes are counted by the phase that they ended in.
@@ -139,9 +135,8 @@ def run_report(
         sections.append(
             Section("Success against cost", figures=curve_figures(runs, target), notes=(words,))
         )
-    if films or no_films:
-        lead = (f"No films: {no_films}",) if no_films else ()
-        sections.append(Section("How it looks", lead, films=tuple(films)))
+    if films:
+        sections.append(Section("How it looks", films=tuple(films)))
     parts.setdefault("fingerprint", tested.fingerprint)
     return Report(sections=tuple(sections), **parts)
 

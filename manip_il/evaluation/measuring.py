@@ -300,7 +300,7 @@ def evaluate(
         )
         made = film_outcomes(engine, job, result, films, progress)
     if output_dir is not None and about is not None:
-        replace(eval_report(result, *made), **about).write(output_dir)
+        replace(eval_report(result, made), **about).write(output_dir)
     return result
 
 

@@ -76,9 +76,7 @@ def test_whatever_comes_from_outside_is_escaped():
     evil = replace(made, robot=EVIL, task=EVIL, fingerprint={EVIL: EVIL})
     assert (
         page_of(
-            replace(
-                eval_report(evil, [Film(EVIL, MP4, EVIL)], EVIL), command=EVIL, config={EVIL: EVIL}
-            )
+            replace(eval_report(evil, [Film(EVIL, MP4, EVIL)]), command=EVIL, config={EVIL: EVIL})
         ).text.count("alert")
         > 20
     )

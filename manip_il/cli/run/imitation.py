@@ -138,7 +138,7 @@ def run_demo(options: DemoOptions) -> None:
     kept = f"every finished episode, round and evaluation, in {options.output_dir}"
     with options.open() as folder, Stages(kept) as stages, options.open_engine() as engine:
         sides = _measure(options, config, folder, engine, stages)
-        films, no_films = _film(sides, config, stages)
+        films = _film(sides, config, stages)
     disturbed = [Side.of(side.name, side.disturbed) for side in sides if side.disturbed]
     verdict, *facts = (
         prefix + Comparison(tested[place], tested[-1]).verdict
@@ -152,7 +152,6 @@ def run_demo(options: DemoOptions) -> None:
         sides,
         [Side("DAgger", (read_member(folder / "dagger"),))],
         films,
-        no_films,
         title=f"Demo: {config.env.robot} {config.env.task}",
         verdict=verdict,
         facts=tuple(facts),
@@ -212,7 +211,7 @@ def _measure(
     ]
 
 
-def _film(sides: Sequence[Side], config: RunConfig, stages: Stages) -> tuple[list[Film], str]:
+def _film(sides: Sequence[Side], config: RunConfig, stages: Stages) -> list[Film]:
     """Film every policy on the first seed on which DAgger succeeds and cloning fails, else on
     the first seed.
     """
