@@ -11,7 +11,7 @@ from manip_il.data.atomic import read_lines
 from manip_il.errors import ManipError
 from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.eval_report import run_report
-from manip_il.evaluation.report import CLONING, DAGGER, Report
+from manip_il.evaluation.report import Report
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.side import METRICS_FILE, Member, Side, history
 
@@ -133,9 +133,7 @@ def validation_report(
     labels = {one["round"]: one["labels"] for one in records if "round" in one}
     names = {number: f"{runs[0].unit} {number}" for number in found} | {0: first}
     sides = {
-        number: Side.of(
-            names[number], result, labels=labels.get(number), colour=DAGGER if number else CLONING
-        )
+        number: Side.of(names[number], result, labels=labels.get(number))
         for number, result in found.items()
     }
     facts = [
