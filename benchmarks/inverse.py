@@ -95,7 +95,7 @@ def _learn(robot: str, taste: str, count: int, seed: int) -> dict[str, tuple[F64
         ]
         if manip_il(["record", *words, *more, "--quiet"]):
             raise SystemExit("recording failed")
-        shown = [one.demonstration for one in read_carried(root)]
+        shown = read_carried(root)
     found = dict[str, tuple[F64, float]]()
     for method in METHODS:
         begin = time.perf_counter()

@@ -127,7 +127,7 @@ def demonstrate(folder: Path, taste: str, count: int) -> Path:
 
 def learnt(root: Path) -> dict[str, Reward]:
     """Return the reward that each method learns from a dataset."""
-    shown = [one.demonstration for one in read_carried(root)]
+    shown = read_carried(root)
     rng = rng_for(stream_base("training", 0), "irl")
     return {method: Reward(tuple(learn(method, shown, rng).weights.tolist())) for method in METHODS}
 

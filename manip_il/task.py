@@ -24,16 +24,21 @@ from manip_il.tasks.ladder import (
     rise_first,
 )
 from manip_il.tasks.objects import (
+    UPRIGHT,
     add_cube,
     add_furniture,
     add_goal,
     add_object,
     add_part,
+    draw_goal,
+    draw_lying,
+    draw_resting,
+    draw_until,
+    draw_yaw,
     observe_hand,
     observe_object,
 )
 from manip_il.tasks.pick_place import PickPlace
-from manip_il.tasks.starts import UPRIGHT, draw_goal, draw_lying, draw_resting, draw_until, draw_yaw
 
 __all__ = [
     "AT_GOAL",

@@ -3,9 +3,9 @@ import pickle
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.cli.progress import say, warn
+from manip_il.cli.outputs import say, warn
 from manip_il.errors import UnknownName, nearest, shorten
-from manip_il.evaluation.tables import Table
+from manip_il.evaluation.report import Table
 
 
 def test_a_near_name_is_offered_and_all_are_listed():

@@ -44,7 +44,6 @@ ALLOWED = {
     "collect/ray_pool.py": "what this process opened before it sends it to a node",
     "worlds/fingerprint.py": "the kernel's files of the processor",
     "data/atomic.py": "locks and flushes what it writes",
-    "chapter/learning.py": "the state of a run's own last checkpoint",
     "robots/robot.py": "a user's model, after its included files were read",
     "serve/operator.py": "the kernel's file of this process",
     "sim/scene.py": "the empty scene, which ships with the package",

@@ -13,9 +13,7 @@ from manip_il.evaluation.comparison import Comparison
 from manip_il.evaluation.eval_report import run_report
 from manip_il.evaluation.report import Report
 from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.evaluation.rounds import METRICS_FILE, history
-from manip_il.evaluation.side import Member, Side
-from manip_il.evaluation.tables import CLONING, DAGGER
+from manip_il.evaluation.side import METRICS_FILE, Member, Side, history
 
 STAGES = ("collect", "fit", "validate")
 VALIDATION = "validation"
@@ -135,9 +133,7 @@ def validation_report(
     labels = {one["round"]: one["labels"] for one in records if "round" in one}
     names = {number: f"{runs[0].unit} {number}" for number in found} | {0: first}
     sides = {
-        number: Side.of(
-            names[number], result, labels=labels.get(number), colour=DAGGER if number else CLONING
-        )
+        number: Side.of(names[number], result, labels=labels.get(number))
         for number, result in found.items()
     }
     facts = [

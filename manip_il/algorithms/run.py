@@ -46,9 +46,9 @@ from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.atomic import CHECKPOINT, append_line, new_folder, read_lines
 from manip_il.data.build import Recording
 from manip_il.data.dataset import Dataset
+from manip_il.evaluation.measuring import measure
 from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.evaluation.rounds import METRICS_FILE
-from manip_il.evaluation.runner import measure
+from manip_il.evaluation.side import METRICS_FILE
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.progress import Progress
 from manip_il.seeding import stream_seeds

@@ -19,10 +19,8 @@ from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError
-from manip_il.evaluation.figures import CLONING, DAGGER, Figure, drawing, to_figure
-from manip_il.evaluation.report import Report, Section
-from manip_il.evaluation.tables import Table
-from manip_il.mdp import F64, I64
+from manip_il.evaluation.report import Report, Section, Table
+from manip_il.mdp import F64
 from manip_il.robots.table import get_robot
 from manip_il.tasks.carry.grid import (
     LENGTH,
@@ -44,28 +42,10 @@ _TASTES = 20  # random weight vectors whose paths show whether a feature matters
 CARRY = "carry"
 _MOVED = 0.004  # distance from the start beyond which an object counts as moving [m]
 FILE_NAME = "reward.json"
-_PANELS = 3
 
 
-@dataclass(frozen=True)
-class Carried:
-    """The path of an episode's object.
-
-    Attributes:
-        episode: Number of the episode.
-        grid: The grid over the episode's layout.
-        positions: Positions of the object from its start to the goal, (T, 3) [m].
-        demonstration: The path on the grid.
-    """
-
-    episode: int
-    grid: Grid
-    positions: F64
-    demonstration: Demonstration
-
-
-def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> list[Carried]:
-    """Return the object's paths in a dataset's successful episodes, in order.
+def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> list[Demonstration]:
+    """Return the object's paths in a dataset's successful episodes, on grids over their layouts.
 
     Raises `ManipError` if the task is not `carry`, no episode succeeded, or a path leads through an
     obstacle.
@@ -81,7 +61,7 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
     scene = scene_of(get_robot(spec.robot).name, CARRY, spec.object)
     index = table[EPISODE_INDEX].ravel()
     at = [names.index(f"{OBJECT}.{axis}") for axis in "xyz"]
-    found = list[Carried]()
+    found = list[Demonstration]()
     for episode in np.unique(index[table[schema.SUCCESS].ravel() != 0]).tolist():
         on_episode()
         rows = table[schema.ENVIRONMENT_STATE][index == episode].astype(np.float64)
@@ -93,7 +73,7 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
             raise ManipError(
                 f"episode {episode}: the object's path does not lead through free space to the goal"
             )
-        found.append(Carried(episode, grid, positions, Demonstration(grid.problem, path)))
+        found.append(Demonstration(grid.problem, path))
     if not found:
         raise ManipError(f"{root}: the object reaches the goal in none of its episodes")
     return found
@@ -161,12 +141,12 @@ class Inverse:
 
     Attributes:
         source: The dataset, in words.
-        carried: The demonstrated paths.
+        demonstrations: The demonstrated paths.
         learnt: The weights.
     """
 
     source: str
-    carried: tuple[Carried, ...]
+    demonstrations: tuple[Demonstration, ...]
     learnt: Learnt
 
     @property
@@ -175,16 +155,13 @@ class Inverse:
         return tuple(FEATURES[k] for k in self.learnt.open)
 
     @cached_property
-    def replanned(self) -> tuple[tuple[I64, F64], ...]:
-        """Cheapest paths from the demonstrations' starts: nodes (n,) and features (K,) of each."""
-        shown = [one.demonstration for one in self.carried]
-        return tuple(plan(one.problem, self.learnt.weights).path(one.start) for one in shown)
-
-    @property
     def means(self) -> tuple[F64, F64]:
-        """Mean features of the demonstrations and of the re-planned paths, (K,) [m]."""
-        shown = np.mean([one.demonstration.sums for one in self.carried], axis=0)
-        return shown, np.mean([sums for _, sums in self.replanned], axis=0)
+        """Mean features of the demonstrations and of the cheapest paths from their starts, (K,)
+        [m].
+        """
+        shown, weights = self.demonstrations, self.learnt.weights
+        planned = [plan(one.problem, weights).path(one.start)[1] for one in shown]
+        return np.mean([one.sums for one in shown], axis=0), np.mean(planned, axis=0)
 
     @property
     def excess(self) -> float:
@@ -205,7 +182,7 @@ class Inverse:
             "level": None if intervals is None else LEVEL,
             "not_identified": self.open_names,
             "method": self.learnt.method,
-            "demonstrations": len(self.carried),
+            "demonstrations": len(self.demonstrations),
             "source": self.source,
             "excess": self.excess,
         }
@@ -240,47 +217,11 @@ def inverse_report(found: Inverse) -> Report:
             ),
         )
     weights = Section("What a metre costs", tables=(weight_table(found),), notes=notes)
-    costs = Section(
-        "The cost over the table",
-        figures=(_cost_figure(found),),
-        notes=(
-            (
-                "Cost of a metre of path, seen from above, at the height at which the object was"
-                " carried. Solid: demonstrated path. Dashed: cheapest path for these weights."
-            ),
-        ),
-    )
     return Report(
         title="Costs inferred from demonstrations",
         verdict=(
-            f"By the learnt weights, the {len(found.carried)} demonstrations cost"
+            f"By the learnt weights, the {len(found.demonstrations)} demonstrations cost"
             f" {found.excess:.1%} more than the cheapest paths."
         ),
-        sections=(weights, costs),
+        sections=(weights,),
     )
-
-
-def _cost_figure(found: Inverse) -> Figure:
-    """Maps of the cost per metre, with demonstrated and planned path, for layouts with the most
-    things on the table.
-    """
-    pairs = zip(found.carried, found.replanned, strict=True)
-    shown = sorted(pairs, key=lambda pair: -len(pair[0].grid.layout.places))[:_PANELS]
-    with drawing(len(shown), size=(3.0, 3.1)) as (drawn, axes):
-        for axis, (one, (path, _)) in zip(axes[0], shown, strict=True):
-            points = one.grid.points
-            over = points.reshape(*one.grid.shape, 3)[:, :, 0].copy()
-            over[:, :, 2] = np.median(one.positions[:, 2])
-            costs = one.grid.layout.densities(over.reshape(-1, 3)) @ found.learnt.weights
-            costs = costs.reshape(over.shape[:2])
-            image = axis.contourf(over[:, :, 0], over[:, :, 1], costs, 20, cmap="Greens")
-            drawn.colorbar(image, ax=axis, location="bottom", shrink=0.8)
-            for name, place in one.grid.layout.places:
-                axis.text(*place, name, ha="center", va="center")
-            axis.plot(*one.positions[:, :2].T, "-", color=DAGGER, label="demonstrated")
-            axis.plot(*points[path, :2].T, "--", color=CLONING, label="re-planned")
-            axis.set(title=f"episode {one.episode}", xticks=[], yticks=[], aspect="equal")
-        drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
-        return to_figure(
-            drawn, "Cost of a metre of path over the table, with demonstrated and re-planned paths"
-        )

@@ -1,10 +1,8 @@
 """Learning by reinforcement in simulation: GAIL, AIRL and PPO, as loops over a run, and the agent
 that they improve.
 
-Each iteration runs whole episodes, with its own seeds and random streams, so a killed run that is
-resumed from its last finished iteration ends with the same bytes.
+Each iteration runs whole episodes, with its own seeds and random streams.
 
-    checkpoints/last/    the last finished iteration
     validation/          every validated policy and its eval.json, by iteration
     metrics.jsonl        a line per iteration
     best/                the policy with the highest validation success; on a tie the latest
@@ -12,19 +10,15 @@ resumed from its last finished iteration ends with the same bytes.
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, override
 
 import numpy as np
-from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
-from safetensors.torch import load_file, save_file
 
-from manip_il import checks
 from manip_il.algorithms.results import VALIDATION, Result, Stopwatch, best_validation, validations
 from manip_il.algorithms.run import Run
 from manip_il.chapter.config import LONGER, LearningConfig
@@ -45,24 +39,16 @@ from manip_il.chapter.ppo import (
 from manip_il.chapter.reward import LearnedReward
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import HOLD, RolloutJob
-from manip_il.data.atomic import CHECKPOINT, kind_of, new_folder
-from manip_il.errors import UsageError
+from manip_il.data.atomic import new_folder
+from manip_il.errors import FolderExistsError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.learn.checkpoint import Checkpoint, Origin, in_one_line
+from manip_il.evaluation.side import METRICS_FILE
+from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.network import threads
-from manip_il.learn.training_state import (
-    PRETRAINED_MODEL,
-    STEP_FILE,
-    TRAINING_STATE,
-    last_checkpoint,
-    new_checkpoint,
-)
+from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 from manip_il.worlds.table import env_fingerprint, env_spec
-
-_CHECKPOINTS = "checkpoints"
-_WEIGHTS = "weights.safetensors"
 
 
 def gail(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
@@ -102,7 +88,7 @@ def ppo(
     The method is PPO (Schulman et al. 2017).
 
     Args:
-        run: The run, which makes the agent and saves its iterations.
+        run: The run, which makes the agent and validates it.
         c: Options of the run.
         reward: Maps rows of joint state, environment state and absolute action, (N, n + k + n), to
             rewards (N,); by default the reward in the folder `c.reward`.
@@ -123,15 +109,26 @@ METHODS = {"gail": gail, "airl": airl, "ppo": ppo}
 
 
 class LearningRun(Run):
-    """One run of GAIL, AIRL or PPO in a folder.
+    """One run of GAIL, AIRL or PPO in a folder that holds no other run.
 
     Attributes:
         config: A `LearningConfig`.
     """
 
+    _validated_at = 0  # control steps at the last validation
+    _policy = Path()  # the policy that was validated last
+
     @override
     def results(self) -> Iterator[Result]:
-        """Run or resume the loop of `config.method`, and yield its results."""
+        """Run the loop of `config.method`, and yield its results.
+
+        The policy of a result is the one that was validated last.
+
+        Raises:
+            FolderExistsError: If the folder holds a run.
+        """
+        if (self.folder / METRICS_FILE).exists():
+            raise FolderExistsError(self.folder)
         return self.follow(METHODS[self.config.method](self, self.config))
 
     def agent(self) -> Agent:
@@ -139,67 +136,42 @@ class LearningRun(Run):
         return Agent(self.config, self._clock)
 
     def begin(self, agent: Agent) -> Iterator[Result]:
-        """Load the agent's last finished iteration and yield its result.
-
-        Else yield that of the initial clone, if any.
-
-        An iteration thus gets its line in `metrics.jsonl` even if the run was killed right after
-        saving its checkpoint.
-        """
-        checkpoint, start = last_checkpoint(self.folder, resume=True), self.config.start
-        if checkpoint is not None:
-            agent.load(checkpoint)
-            yield self._result(agent, checkpoint / PRETRAINED_MODEL)
-        elif start is not None:
-            yield self._result(agent, start)
+        """Yield the result of the initial clone, if there is one."""
+        if self.config.start is not None:
+            yield self.finish(agent)
 
     def finish(self, agent: Agent) -> Result:
-        """Save the finished iteration; validate its policy if that is due."""
-        folder = self.folder / _CHECKPOINTS
-        made = folder / f"{agent.number:06d}"
-        agent.save(made)
-        for other in folder.iterdir():
-            if not other.is_symlink() and other != made and kind_of(other) == CHECKPOINT:
-                shutil.rmtree(other, ignore_errors=True)
-        self._progress.step()
-        return self._result(agent, folder / "last" / PRETRAINED_MODEL)
-
-    def _result(self, agent: Agent, policy: Path) -> Result:
-        """The result of an agent's iteration, validated if validation is due.
+        """Return the result of a finished iteration, validated if validation is due.
 
         Iteration 0 is always validated.
         """
         every, validated = self.config.validation_every, None
-        due = agent.simulated // every != agent.validated_at // every
+        due = agent.simulated // every != self._validated_at // every
         if due or agent.simulated >= self.config.steps or agent.number == 0:
-            agent.validated_at = agent.simulated
-            validated = self._validate_copy(policy, agent.number)
+            self._validated_at = agent.simulated
+            validated = self._validate(agent)
+        self._progress.step()
         return Result(
             unit="iteration",
             number=agent.number,
             steps=agent.simulated,
             episodes=agent.number * self.config.episodes,
             metrics=agent.metrics,
-            policy=policy,
+            policy=self._policy,
             validated=validated,
             seconds=self._clock.take(),
         )
 
-    def _validate_copy(self, policy: Path, number: int) -> EvalResult:
-        """Copy a policy into the run and evaluate it, unless that is done.
-
-        Copy it to `best` if it is the best.
-        """
-        here = self.folder / VALIDATION / f"{number:06d}"
-        if not here.is_dir():
-            with new_folder(here) as new:
-                shutil.copytree(policy, new / PRETRAINED_MODEL)
-        job = RolloutJob(
-            self.config.env, PolicyDriver.of(here / PRETRAINED_MODEL), HOLD, label="last"
-        )
-        found = self._evaluate(job, here / FILE_NAME, f"iteration {number}")
-        if number == best_validation(validations(self.folder)):
-            self._keep_best(policy)
+    def _validate(self, agent: Agent) -> EvalResult:
+        """Save the policy in the run and evaluate it; copy it to `best` if it is the best."""
+        here = self.folder / VALIDATION / f"{agent.number:06d}"
+        self._policy = here / PRETRAINED_MODEL
+        with new_folder(here) as new:
+            agent.save(new / PRETRAINED_MODEL)
+        job = RolloutJob(self.config.env, PolicyDriver.of(self._policy), HOLD, label="last")
+        found = self._evaluate(job, here / FILE_NAME, f"iteration {agent.number}")
+        if agent.number == best_validation(validations(self.folder)):
+            self._keep_best(self._policy)
         return found
 
 
@@ -210,7 +182,6 @@ class Agent:
         number: Iterations so far.
         simulated: Control steps so far.
         metrics: Metrics of the last iteration.
-        validated_at: Control steps at the last validation.
     """
 
     def __init__(self, config: LearningConfig, clock: Stopwatch):
@@ -228,7 +199,7 @@ class Agent:
             NotFiniteError: If a number in the demonstrations is not finite.
         """
         self.config, self._clock = config, clock
-        self.number = self.simulated = self.validated_at = 0
+        self.number = self.simulated = 0
         self.metrics: dict[str, float] = {}
         self._spec = env_spec(config.env)
         start = None if config.start is None else Checkpoint.open(config.start)
@@ -247,19 +218,16 @@ class Agent:
             self.envs = Lockstep(episodes, actions, horizon, self._conversion)
             log_std, clone = config.first_log_std, start is not None
             self._learner = Learner(self._policy.model, config.ppo, self.envs, log_std, clone=clone)
-        self._modules: dict[str, Any] = {"actor_critic": self._learner.policy}
         self._expert = shown.padded(horizon, actions.normalised) if shown else None
 
     def discriminator(self, gamma: float | None = None) -> Discriminator:
-        """Return a discriminator, which is saved with the agent.
+        """Return an untrained discriminator.
 
         Args:
             gamma: Discount per control step in AIRL's f; None for GAIL's form.
         """
         seed_generators(self._stream("discriminator"))
-        made = Discriminator(self.config.discriminator, self._policy.model, gamma)
-        self._modules["discriminator"] = made
-        return made
+        return Discriminator(self.config.discriminator, self._policy.model, gamma)
 
     def rollouts(self) -> None:
         """Start an iteration by running its episodes."""
@@ -312,31 +280,17 @@ class Agent:
             self.metrics |= self._learner.improve(rewards, actor=warm, remaining=remaining)
 
     def save(self, folder: Path) -> None:
-        """Write a checkpoint of the iteration: its policy, and everything that the next
-        iteration needs.
-        """
-        fingerprint, space = env_fingerprint(self.config.env), self._conversion.space
-        origin = Origin.of(self._spec, fingerprint, self._options(), action_space=space)
-        with new_checkpoint(folder) as new:
-            save_policy(self._policy, self._conversion, new / PRETRAINED_MODEL)
-            (new / TRAINING_STATE).mkdir()
-            save_modules(self._modules, new / TRAINING_STATE)
-            step = {
-                "step": self.number,
-                "simulated": self.simulated,
-                "metrics": self.metrics,
-                "validated_at": self.validated_at,
-            }
-            (new / TRAINING_STATE / STEP_FILE).write_text(json.dumps(step))
-            origin.write(new / PRETRAINED_MODEL)
-
-    def load(self, folder: Path) -> None:
-        """Load a checkpoint to continue from. Raises `ManipError` if it is incomplete."""
-        step = checks.read_json(folder / TRAINING_STATE / STEP_FILE, "the step of a run")
-        with in_one_line(f"{folder} cannot be resumed"), threads(1):
-            self.number, self.simulated = step["step"], step["simulated"]
-            self.metrics, self.validated_at = step["metrics"], step["validated_at"]
-            load_modules(self._modules, folder / TRAINING_STATE)
+        """Write the policy to a `pretrained_model` folder, that of iteration 0 as it was given."""
+        start, space = self.config.start, self._conversion.space
+        if self.number == 0 and start is not None:
+            shutil.copytree(start, folder)
+            return
+        save_policy(self._policy, self._conversion, folder)
+        fingerprint = env_fingerprint(self.config.env)
+        Origin.of(self._spec, fingerprint, self._options(), action_space=space).write(folder)
+        # without this, other users, such as a container's, could not read them
+        for path in folder.glob("*.safetensors"):
+            path.chmod(folder.stat().st_mode & 0o666)
 
     def _options(self) -> dict[str, Any]:
         """The options that are stored in a checkpoint."""
@@ -350,20 +304,3 @@ class Agent:
         """The seed for one purpose in the current iteration."""
         base = stream_base("reinforcement", self.config.seed)
         return int(rng_for(base + self.number, purpose).integers(2**63))
-
-
-def save_modules(modules: Mapping[str, Any], folder: Path) -> None:
-    """Write the weights of modules (name -> module), and the states of their optimisers, to a
-    folder.
-    """
-    for name, module in modules.items():
-        (folder / name).mkdir()
-        save_file(module.state_dict(), folder / name / _WEIGHTS)
-        save_optimizer_state(module.optimizer, folder / name)
-
-
-def load_modules(modules: Mapping[str, Any], folder: Path) -> None:
-    """Read what `save_modules` has written."""
-    for name, module in modules.items():
-        module.load_state_dict(load_file(folder / name / _WEIGHTS))
-        load_optimizer_state(module.optimizer, folder / name)

@@ -4,7 +4,7 @@ stable-baselines3's `PPO`.
 (Schulman et al., Proximal policy optimization algorithms, 2017.) The actor is a new network, or
 that of a clone, with a new spread of its actions. An iteration is one rollout of whole episodes
 that all begin and end together, so that only the weights and the optimiser's state persist between
-iterations; they are saved as safetensors and JSON.
+iterations.
 """
 
 import math

@@ -12,7 +12,7 @@ from typing import ClassVar, Literal
 
 from manip_il.chapter.config import DiscriminatorConfig, LearningConfig, PPOConfig
 from manip_il.cli.common_options import DatasetRoots, EngineOptions, OfDataset, worker_count
-from manip_il.cli.outputs import Output, OutputFile, ResumableOutput, output_file, output_folder
+from manip_il.cli.outputs import Output, OutputFile, output_file, output_folder
 from manip_il.cli.parsing import Given, given
 from manip_il.option import Seeded, option
 
@@ -135,11 +135,10 @@ class TheoryOptions(EngineOptions, Output):
 
 
 @dataclass(frozen=True)
-class Learning(EngineOptions, ResumableOutput):
+class Learning(EngineOptions, Output):
     """What `rl gail`, `rl airl` and `rl ppo` share: options, run, progress and report."""
 
     method: ClassVar[str]
-    first: ClassVar[str] = "dataset.root init steps reward validation_episodes output_dir resume"
     init: Path | None = option(
         None, "a cloned mlp (a checkpoint or a run) to start from; by default a new policy"
     )

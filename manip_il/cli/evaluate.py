@@ -9,7 +9,7 @@ seeds.
 
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting
 from manip_il.cli.outputs import ResumableOutput, output_folder
@@ -38,9 +38,6 @@ class EvalGroup:
         at_least=1,
         grows=True,
     )
-    first: int = option(
-        0, "index of the first seed in the stream, to run a large evaluation in parts", at_least=0
-    )
     hold: int | None = option(
         10,
         "control steps after success until an episode ends; null: it ends at the horizon",
@@ -63,18 +60,14 @@ class EvalOptions(Tested, Seeded, Trusting, EngineOptions, ResumableOutput):
     """Measure a policy's success on unseen seeds; writes eval.json and report.html.
 
     With EVALUATION, an eval.json or its folder, no policy is evaluated: --replay=SEED runs one of
-    its episodes again and films it; two or more, such as parts run on several machines, are merged.
+    its episodes again and films it.
     --check renders a picture and reports whether this machine or container can evaluate.
 
     Example: manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert
     """
 
-    first: ClassVar[str] = (
-        "policy.path policy.type eval.n_episodes suite robot.type task.type output_dir replay"
-        " resume"
-    )
-    evaluation: list[Path] = option(
-        list, "evaluations: one with --replay, or several to merge", positional=True
+    evaluation: Path | None = option(
+        None, "the evaluation of which --replay runs an episode again", positional=True
     )
     policy: MeasuredPolicyGroup = field(default_factory=MeasuredPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
@@ -154,7 +147,6 @@ class CompareOptions(ComparisonOptions, Tested, Seeded, Trusting, EngineOptions,
     Example: manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare
     """
 
-    first: ClassVar[str] = "at eval.n_episodes suite output_dir resume training_seeds"
     sides: list[Path] = option(
         MISSING,
         "two sides, each an eval.json, a policy or a run; or the YAML file of a study",

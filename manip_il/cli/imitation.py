@@ -9,7 +9,6 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
 
 from manip_il.algorithms.config import Method, RunConfig
 from manip_il.cli.common_options import (
@@ -52,9 +51,6 @@ class TrainOptions(Seeded, Trusting, ResumableOutput):
     --output_dir=runs/act
     """
 
-    first: ClassVar[str] = (
-        "dataset.root policy observation action_space steps batch_size output_dir resume"
-    )
     dataset: SourceGroup
     weights: Path | None = option(
         None,
@@ -90,9 +86,6 @@ class RecordOptions(Varied, Seeded, EngineOptions, Resumable):
     Example: manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos
     """
 
-    first: ClassVar[str] = (
-        "robot.type task.type dataset.root dataset.num_episodes cameras seed resume"
-    )
     env: Given = given(EnvConfig)
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
     preset: Published | None = option(
@@ -127,9 +120,6 @@ class DaggerOptions(Varied, Trusting, EngineOptions, ResumableOutput):
     Example: manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger
     """
 
-    first: ClassVar[str] = (
-        "robot.type task.type demonstrations rounds episodes_per_round policy output_dir resume"
-    )
     env: Given = given(EnvConfig)
     method: Method = option(
         "dagger",
@@ -166,7 +156,6 @@ class DemoOptions(EngineOptions, ResumableOutput):
     Example: manip-il demo --output_dir=runs/demo
     """
 
-    first: ClassVar[str] = "robot.type task.type rounds test_episodes output_dir resume"
     env: Given = given(EnvConfig)
     settings: Given = given(
         RunConfig, prefix="", only=(*RUN, "episodes_per_round", "disturbed_share", "seed"), **RUN

@@ -16,7 +16,7 @@ from typing import Any
 
 from manip_il import __version__
 from manip_il.bridges.store.errors import redact
-from manip_il.cli import progress
+from manip_il.cli import outputs
 from manip_il.cli.parsing import Option, metavar, options_of, parse, word
 from manip_il.errors import ManipError, UnknownName, printable, silence_ffmpeg_warning, told
 
@@ -43,11 +43,11 @@ COMMANDS = {
         "evaluate:CompareOptions:imitation",
         "compare policies, runs or whole studies on the same seeds",
     ),
-    "view": ("robots:ViewOptions:view", "watch a robot at its task, in a window or a browser"),
+    "view": ("robots:ViewOptions:view", "watch a robot at its task, in a window or from a file"),
     "serve": ("robots:ServeOptions:serve", "run a virtual SO-101 for LeRobot's own programs"),
     "push": ("transfer:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
     "pull": ("transfer:PullOptions", "download a dataset or policy and verify every file"),
-    "export": ("transfer:ExportOptions:export", "export a policy as ONNX"),
+    "export": ("transfer:ExportOptions:train", "export a policy as ONNX"),
     "theory": (
         "chapter:TheoryOptions",
         "compare the proven bounds of cloning and DAgger with a run",
@@ -110,7 +110,7 @@ GROUPS = {
     "rl": "reinforcement learning: GAIL, AIRL, PPO",
     "reward": "learn rewards from demonstrations or preferences",
 }
-HELP = ("--help", "-h", "--help=all")
+HELP = ("--help", "-h")
 _GLOBAL_HELP = """\
   --debug      show the traceback of an error
   --quiet      show no progress on standard error"""
@@ -125,8 +125,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # the words after `--` are another program's
     end = given.index("--") if "--" in given else len(given)
     own = [word for word in given[:end] if word not in ("--debug", "--quiet")]
-    progress.set_quiet("--quiet" in given[:end])
-    logging.getLogger("manip_il").handlers = [progress.Warnings()]
+    outputs.set_quiet("--quiet" in given[:end])
+    logging.getLogger("manip_il").handlers = [outputs.Warnings()]
     try:
         _dispatch(own, given[end:])
     except (Exception, KeyboardInterrupt) as error:
@@ -163,7 +163,7 @@ def _dispatch(own: list[str], others: list[str]) -> None:
     elif {*HELP} & {*words}:
         print(_command_help(name, load(name), words))
     else:
-        options = parse(load(name), [*words, *others], command=name)
+        options = parse(load(name), [*words, *others])
         silence_ffmpeg_warning()
         run(name, options)
 
@@ -212,21 +212,17 @@ def _help(group: str = "") -> str:
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
-    """Return the help of one command: its most used options (`first`), or all with `--help=all`.
+    """Return the help of one command.
 
     words: the command line; with `--policy.type=act` the options of that policy are listed, too.
     """
     options = options_of(cls)
-    first = () if "--help=all" in words else getattr(cls, "first", "").split()
     positional = [option for option in options if option.positional]
     places = "".join(
         f" {one.label}" if one.default is MISSING else f" [{one.label}]" for one in positional
     )
-    rows = dict(_row(one) for one in options if not first or one.positional or one.name in first)
-    rest = len(options) - len(rows)
+    rows = dict(map(_row, options))
     rows["--config_path=FILE.yaml"] = "read options from YAML; the command line overrides them"
-    if rest:
-        rows["--help=all"] = f"also list the other {rest} options"
     kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
     more = ""
     if kind and any(one.is_open for one in options):

@@ -286,20 +286,19 @@ class _Value(NamedTuple):
     origin: str
 
 
-def parse[T](cls: type[T], words: Sequence[str], command: str = "COMMAND") -> T:
+def parse[T](cls: type[T], words: Sequence[str]) -> T:
     """Read options from the command line.
 
     Args:
         cls: The dataclass of the command's options.
         words: The words after the command's name.
-        command: The command's name, for error messages.
 
     Raises:
         UsageError: for an unknown name, or for an invalid or missing value.
     """
     known = _named(options_of(cls))
     known[CONFIG_PATH] = Option(CONFIG_PATH, (), Path, None, {})
-    raw = _read_words(words, known, command)
+    raw = _read_words(words, known)
     file = raw.pop(CONFIG_PATH, None)
     layers = [] if file is None else [(file.value, read_yaml(Path(file.value), _EXPECTED))]
     return from_layers(cls, layers, raw)
@@ -356,7 +355,7 @@ def dump_yaml(options: Any) -> str:
     return header + yaml.safe_dump(to_plain(options), sort_keys=False)
 
 
-def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _Value]:
+def _read_words(words: Sequence[str], known: Known) -> dict[str, _Value]:
     """Return each option's value as given on the command line."""
     raw: dict[str, _Value] = {}
     places = [option for option in known.values() if option.positional]
@@ -371,7 +370,7 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _
         if word.startswith("--"):
             option = _find(name, known)
             if option is None or option.positional:
-                raise _unknown_option("option", f"--{name}", known, command)
+                raise _unknown_option("option", f"--{name}", known)
             kind = Any if option.is_open else option.type
             if not equals and kind is bool:
                 value = rest.pop(0) if rest and rest[0] in ("true", "false") else "true"
@@ -383,7 +382,7 @@ def _read_words(words: Sequence[str], known: Known, command: str) -> dict[str, _
                 )
             raw[name] = _Value(option, value, f"--{name}")
         elif not places or word.startswith("-"):
-            wanted = f"write options as --name=value; manip-il {command} --help=all lists them"
+            wanted = "write options as --name=value; --help lists them"
             raise UsageError(f"unexpected {shorten(word)}; {wanted}")
         elif (option := places[0]).is_list:
             raw.setdefault(option.name, _Value(option, [], option.label)).value.append(word)
@@ -418,7 +417,7 @@ def _read_tree(tree: Any, known: Known, origin: str, prefix: str = "") -> dict[s
         elif any(other == name or other.startswith(f"{name}.") for other in known):
             raw |= _read_tree(value, known, origin, f"{name}.")
         else:
-            raise _unknown_option(f"key in {origin}:", name, known, "COMMAND")
+            raise _unknown_option(f"key in {origin}:", name, known)
     return raw
 
 
@@ -453,9 +452,8 @@ def _decode(one: _Value) -> Any:
     return value
 
 
-def _unknown_option(kind: str, name: str, known: Known, command: str) -> UsageError:
-    """Return the error for an unknown option or key, with the nearest names and the command that
-    lists all.
+def _unknown_option(kind: str, name: str, known: Known) -> UsageError:
+    """Return the error for an unknown option or key, with the nearest names.
 
     `num_episodes` finds `dataset.num_episodes`. kind: `option`, or `key in FILE:`.
     """
@@ -467,6 +465,4 @@ def _unknown_option(kind: str, name: str, known: Known, command: str) -> UsageEr
     if not name.startswith("--"):
         labels = [label.replace("--", "") for label in labels]
     near = nearest(name, labels, _MOST_OFFERED)
-    return UsageError(
-        f"unknown {kind} {shorten(name)}{near}; manip-il {command} --help=all lists all"
-    )
+    return UsageError(f"unknown {kind} {shorten(name)}{near}; --help lists all")

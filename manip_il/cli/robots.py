@@ -1,5 +1,4 @@
-"""`manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun if there is no
-display.
+"""`manip-il view`: a robot at its task, live in MuJoCo's viewer, or in a file of Rerun's.
 
 `manip-il serve`: a virtual SO-101 behind serial ports, for LeRobot's own programs.
 
@@ -9,7 +8,7 @@ expert can do.
 
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting, Varied
 from manip_il.cli.outputs import Output, Replacing, output_folder
@@ -27,26 +26,23 @@ class WatchedPolicyGroup:
     """`--policy.*`: the policy that drives."""
 
     path: Path | None = option(None, "a checkpoint or a run")
-    type: Literal["expert", "random", "sliders"] | None = option(
-        None,
-        "who drives instead of a checkpoint, by default the expert; sliders: you, in the window",
+    type: Literal["expert", "random"] | None = option(
+        None, "who drives instead of a checkpoint, by default the expert"
     )
 
 
 @dataclass(frozen=True)
 class ViewOptions(Tested, Seeded, Trusting):
-    """Watch a robot at its task in MuJoCo's viewer.
+    """Watch a robot at its task in MuJoCo's viewer, or write what happens to a file of Rerun's.
 
-    Without a display, in a browser (Rerun) or from a file.
-
-    Episodes run in real time until --n_episodes have ended, the window is closed or Ctrl-C is
-    pressed. The browser shows pictures, joints, actions, phase and progress. --output writes these
-    as fast as possible to a file, which `rerun FILE.rrd` opens on any machine.
+    In the viewer, episodes run in real time until --n_episodes have ended, the window is closed or
+    Ctrl-C is pressed. --output writes pictures, joints, actions, phase and progress as fast as
+    possible to a file, which `rerun FILE.rrd` opens on any machine, and `rerun --web-viewer
+    FILE.rrd` in a browser.
 
     Example: manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd
     """
 
-    first: ClassVar[str] = "policy.path policy.type robot.type task.type n_episodes output"
     policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
     n_episodes: int | None = option(
@@ -56,19 +52,17 @@ class ViewOptions(Tested, Seeded, Trusting):
 
 
 @dataclass(frozen=True)
-class ServeOptions(Varied, Trusting):
+class ServeOptions(Varied):
     """Run a simulated SO-101 behind serial ports, which LeRobot's own programs open like those of a
     real arm.
 
     Prints both ports, the cameras, and a command line to copy. With `-- COMMAND ...` it runs that
     program on the ports and presses its keys as a person would: an episode ends when the task is
-    solved, and a failed one is recorded again. --vary=servo also varies the servos. A policy as the
-    leader (--leader=runs/lift) sets the default task and cameras.
+    solved, and a failed one is recorded again. --vary=servo also varies the servos.
 
     Example: manip-il serve --task.type=lift --cameras=front,wrist
     """
 
-    first: ClassVar[str] = "task.type cameras leader servo log output_dir"
     command: list[str] = option(
         list, "a LeRobot program and its options, after `--`", positional=True
     )
@@ -128,7 +122,6 @@ class CertifyOptions(Seeded, EngineOptions, Output):
     Example: manip-il robot certify --task.type=stack --output_dir=runs/certificate
     """
 
-    first: ClassVar[str] = "robot.type task.type cases output_dir"
     env: Given = given(EnvConfig)
     cases: int = option(
         500, "episodes for each kind of perturbation", at_least=1, at_most=1_000_000

@@ -27,7 +27,6 @@ class PushOptions:
         " file://FOLDER",
         positional=True,
     )
-    journals: bool = option(False, "include the journals, from which the dataset can be rebuilt")
     private: bool = option(False, "make a new repository on the Hub private")
     dry_run: bool = option(False, "only list what would be uploaded and removed")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from manip_il.collect.drivers import Driver, ExpertDriver, Setting
 from manip_il.collect.query import LabelMode, Query, branch, cut_at_takeover, gate_of, labelled
-from manip_il.collect.rollout import Act, Rules, rollout
+from manip_il.collect.rollout import Rules, rollout
 from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.errors import MismatchError
 from manip_il.learn.checkpoint import Checkpoint
@@ -133,7 +133,7 @@ class RolloutJob:
 
 
 def run_steps(
-    job: RolloutJob, envs: Sequence[Environment], seeds: Iterable[int], act: Act | None = None
+    job: RolloutJob, envs: Sequence[Environment], seeds: Iterable[int]
 ) -> Iterator[Transition]:
     """Run a job's episodes in these environments and yield every step.
 
@@ -141,7 +141,6 @@ def run_steps(
         job: The driver and the rules of the episodes.
         envs: Environments of the job, which run in lockstep.
         seeds: One for each episode.
-        act: Chooses the actions in place of the job's driver; None: the driver does.
 
     Returns:
         The transitions, in the order of `rollout`.
@@ -154,7 +153,7 @@ def run_steps(
     patience = job.patience if env_spec(job.env).has_progress else None
     rules = Rules(job.env.horizon, job.hold, patience, takeover=job.label == "takeover")
     gate = gate_of(job.label, job.query, setting)
-    return rollout(envs, seeds, act or job.driver.start(setting), rules, make_expert(job.env), gate)
+    return rollout(envs, seeds, job.driver.start(setting), rules, make_expert(job.env), gate)
 
 
 def observed_cameras(job: RolloutJob) -> CameraConfig | None:

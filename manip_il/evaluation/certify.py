@@ -25,7 +25,7 @@ from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
-from manip_il.evaluation.tables import INTERVAL, Table
+from manip_il.evaluation.report import INTERVAL, Table
 from manip_il.mdp import Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition

@@ -18,10 +18,9 @@ from manip_il.evaluation.intervals import (
     mean_interval,
     sign_flip_exact,
 )
+from manip_il.evaluation.report import Table
 from manip_il.evaluation.results import require_comparable
-from manip_il.evaluation.rounds import Cost, Round, Rule, costs_of
-from manip_il.evaluation.side import Side
-from manip_il.evaluation.tables import Table
+from manip_il.evaluation.side import Cost, Round, Rule, Side, costs_of
 
 FILE_NAME = "compare.json"
 
@@ -30,7 +29,7 @@ FILE_NAME = "compare.json"
 class Comparison:
     """Two sides, paired by training seed and by test episode.
 
-    Differences are right minus left. Episodes that only one side ran do not count.
+    Differences are right minus left.
 
     Attributes:
         left: The side that is compared with.
@@ -38,7 +37,7 @@ class Comparison:
 
     Raises:
         MismatchError: if robot, task or settings differ.
-        ManipError: if left and right share no episode.
+        ManipError: unless all policies ran the same episodes.
     """
 
     left: Side
@@ -47,10 +46,11 @@ class Comparison:
     def __post_init__(self) -> None:
         for one, other in zip(self.left.results, self.right.results, strict=True):
             require_comparable(self.left.name, one, self.right.name, other)
-        if not all(self._outcomes):
+        results = self.left.results + self.right.results
+        if len({frozenset(one.seed for one in result.episodes) for result in results}) > 1:
             raise ManipError(
-                f"{self.left.name} and {self.right.name} share no seed; evaluate both with the same"
-                " --seed="
+                f"test episodes of {self.left.name} and {self.right.name} differ; evaluate both"
+                " with the same --seed and --eval.n_episodes"
             )
 
     @cached_property
@@ -59,8 +59,7 @@ class Comparison:
         found: list[dict[int, tuple[bool, bool]]] = []
         for left, right in zip(self.left.results, self.right.results, strict=True):
             theirs = {episode.seed: episode.success for episode in right.episodes}
-            ours = (one for one in left.episodes if one.seed in theirs)
-            found.append({one.seed: (one.success, theirs[one.seed]) for one in ours})
+            found.append({one.seed: (one.success, theirs[one.seed]) for one in left.episodes})
         return found
 
     @cached_property
@@ -162,16 +161,7 @@ class Study:
     target: float = 0.95
 
     def __post_init__(self) -> None:
-        for one in self.comparisons.values():
-            ran = {
-                frozenset(episode.seed for episode in it.episodes)
-                for it in one.left.results + one.right.results
-            }
-            if len(ran) > 1:
-                raise ManipError(
-                    f"test episodes of {one.left.name} and {one.right.name} differ; evaluate both"
-                    " with the same --seed and --eval.n_episodes"
-                )
+        _ = self.comparisons  # which raise
 
     @cached_property
     def comparisons(self) -> dict[str, Comparison]:

@@ -2,28 +2,40 @@
 films.
 """
 
-import itertools
+import textwrap
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
+from manip_il.errors import printable
 from manip_il.evaluation.comparison import Study
-from manip_il.evaluation.figures import COLOURS, curve_figures
-from manip_il.evaluation.report import Film, Report, Section
+from manip_il.evaluation.intervals import format_percent
+from manip_il.evaluation.report import (
+    COLOURS,
+    INK,
+    INTERVAL,
+    Figure,
+    Film,
+    Report,
+    Section,
+    Table,
+    drawing,
+    to_figure,
+)
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.side import Side
-from manip_il.evaluation.tables import BASELINE, INTERVAL, Table
+from manip_il.evaluation.side import Side, costs_of
 from manip_il.worlds.table import world_of
 
+_MARKERS = ("o-", "s-", "D-", "^-")  # distinguishable without colour
+_PANEL = (4.4, 3.0)  # size of a figure placed beside others [inches]
 
-def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = "") -> Report:
+
+def eval_report(result: EvalResult, films: Sequence[Film] = ()) -> Report:
     """Return the report of an evaluation.
 
     Args:
         result: The evaluation.
         films: The films to show.
-        no_films: Why there are no films; empty if there are films, or none were asked for.
     """
     settings, success = result.settings, result.success
     solved = world_of(result.robot, result.task).success(settings.tolerance, settings.success_steps)
@@ -47,7 +59,6 @@ def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = 
     return run_report(
         condition_sides(result),
         films=films,
-        no_films=no_films,
         note=note,
         failed=[Side.of("failed episodes", result)],
         title=f"Evaluation of {result.policy}: {result.robot} {result.task}",
@@ -57,9 +68,7 @@ def eval_report(result: EvalResult, films: Sequence[Film] = (), no_films: str = 
 
 def compare_report(study: Study, title: str) -> Report:
     """Return the report of a comparison of sides."""
-    others = [side.name for side in study.sides if side.name != study.baseline]
-    colours = dict(zip(others, itertools.cycle(COLOURS), strict=False))
-    sides = [replace(side, colour=colours.get(side.name, BASELINE)) for side in study.sides]
+    sides = study.sides
     first = sides[0].results[0]
     note = (
         f"Every policy ran {first.success.n:,} test episodes on the same seeds, which selected no"
@@ -71,7 +80,7 @@ def compare_report(study: Study, title: str) -> Report:
     return run_report(
         sides,
         [side for side in sides if side.histories],
-        table=replace(study.table(), colours=tuple(side.colour for side in sides)),
+        table=study.table(),
         note=note,
         failed=[] if study.baseline is None else sides,
         target=study.target,
@@ -85,7 +94,6 @@ def run_report(
     sides: Sequence[Side],
     runs: Sequence[Side] = (),
     films: Sequence[Film] = (),
-    no_films: str = "",
     *,
     table: Table | None = None,
     note: str = "",
@@ -99,7 +107,6 @@ def run_report(
         sides: Measured sides; the conditions of a disturbed one are named.
         runs: Sides whose rounds are drawn as curves.
         films: Films of episodes.
-        no_films: Why there are no films, or empty.
         table: Table of the results, by default that of `success_table`.
         note: A paragraph below the table.
         failed: Sides whose failed episodes are counted by the phase that they ended in.
@@ -128,9 +135,8 @@ def run_report(
         sections.append(
             Section("Success against cost", figures=curve_figures(runs, target), notes=(words,))
         )
-    if films or no_films:
-        lead = (f"No films: {no_films}",) if no_films else ()
-        sections.append(Section("How it looks", lead, films=tuple(films)))
+    if films:
+        sections.append(Section("How it looks", films=tuple(films)))
     parts.setdefault("fingerprint", tested.fingerprint)
     return Report(sections=tuple(sections), **parts)
 
@@ -145,7 +151,7 @@ def condition_sides(result: EvalResult) -> list[Side]:
         return [Side.of(result.policy, result)]
     parts = [Side.of(name, part) for name, part in named.items()]
     whole = "all conditions" if conditions else "all tasks"
-    return [Side.of(whole, result, colour=BASELINE), *parts]
+    return [Side.of(whole, result), *parts]
 
 
 def success_table(sides: Sequence[Side]) -> Table:
@@ -176,4 +182,45 @@ def success_table(sides: Sequence[Side]) -> Table:
         "success at end",
         "steps to success",
     )
-    return Table((*head, "success, disturbed"), tuple(rows), tuple(side.colour for side in sides))
+    return Table((*head, "success, disturbed"), tuple(rows))
+
+
+def curve_figures(sides: Sequence[Side], target: float | None = None) -> tuple[Figure, ...]:
+    """Draw the validation success of each run of the sides against every cost, one figure each.
+
+    Args:
+        sides: The sides.
+        target: Success that is drawn as a horizontal line, in [0, 1].
+    """
+    figures: list[Figure] = []
+    for cost in costs_of(run for side in sides for run in side.histories):
+        with drawing(1, size=_PANEL) as (drawn, axes):
+            axis = axes[0, 0]
+            for place, side in enumerate(sides):
+                label = printable(textwrap.shorten(side.name, 40)).replace("$", r"\$")
+                for run in side.histories:
+                    rates = [100 * one.validation.rate for one in run]
+                    axis.plot(
+                        [one.amount(cost) for one in run],
+                        rates,
+                        _MARKERS[place % 4],
+                        c=COLOURS[place % len(COLOURS)],
+                        label=label,
+                    )
+                    label = ""  # one entry per side in the legend
+            if target is not None:
+                axis.axhline(
+                    100 * target,
+                    color=INK,
+                    ls="--",
+                    lw=1,
+                    label=f"target, {format_percent(target)}",
+                )
+            axis.set(xlabel=cost, ylim=(-2, 102), ylabel="validation success [%]")
+            drawn.legend(loc="outside upper left", ncols=2)
+            figures.append(
+                to_figure(
+                    drawn, f"Validation success over {cost}: {', '.join(one.name for one in sides)}"
+                )
+            )
+    return tuple(figures)

@@ -57,11 +57,8 @@ def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str
     return Film(title, encode_mp4(frames, env.control_hz / FILM_EVERY), caption)
 
 
-def collect_films(made: Iterable[Film], progress: Progress) -> tuple[list[Film], str]:
-    """Return the films and "".
-
-    Without off-screen OpenGL, [] and the reason, which is also logged.
-    """
+def collect_films(made: Iterable[Film], progress: Progress) -> list[Film]:
+    """Return the films; without off-screen OpenGL none, and log the reason."""
     films: list[Film] = []
     try:
         for film in made:
@@ -69,15 +66,15 @@ def collect_films(made: Iterable[Film], progress: Progress) -> tuple[list[Film],
             progress.step()
     except (RenderError, Unable) as error:
         _LOG.warning("the report has no films: %s", error)
-        return [], str(error)
+        return []
     finally:
         progress.close()
-    return films, ""
+    return films
 
 
 def film_outcomes(
     engine: Engine, job: RolloutJob, result: EvalResult, most: int, progress: Progress
-) -> tuple[list[Film], str]:
+) -> list[Film]:
     """Rerun and film some failed and some successful episodes of an evaluation.
 
     Args:
@@ -96,7 +93,7 @@ def film_outcomes(
         for one in [e for e in result.episodes if e.success == good][:most]
     ]
     if not shown:
-        return [], ""
+        return []
     progress.start("films", len(shown))
     episodes = {episode.seed: episode for episode in engine.run(job, [one.seed for one in shown])}
     made = (

@@ -1,9 +1,9 @@
-"""`eval.json`: one evaluation of one policy; reading, merging and comparing evaluations."""
+"""`eval.json`: one evaluation of one policy; reading and comparing evaluations."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -194,8 +194,7 @@ class EvalResult:
         seeds = len({episode.seed for episode in self.episodes})
         if seeds != len(self.episodes):
             raise ManipError(
-                f"evaluation of {self.policy}: {len(self.episodes)} episodes on {seeds} seeds; "
-                "every episode needs its own seed; give each part another --eval.first"
+                f"evaluation of {self.policy}: {len(self.episodes)} episodes on {seeds} seeds"
             )
 
     def env(
@@ -248,27 +247,22 @@ class EvalResult:
 
         "" for episodes without a condition.
         """
-        parts: dict[str, list[EpisodeResult]] = {
-            condition.name: [] for condition in self.settings.conditions
-        }
-        for episode in self.episodes:
-            parts.setdefault(episode.condition, []).append(episode)
-        return {
-            name: replace(self, episodes=tuple(episodes))
-            for name, episodes in parts.items()
-            if episodes
-        }
+        return self._split("condition", [one.name for one in self.settings.conditions])
 
     @cached_property
     def by_task(self) -> dict[str, EvalResult]:
         """Task -> its episodes; {} if there is only one task."""
-        parts: dict[str, list[EpisodeResult]] = {}
+        return {name: part for name, part in sorted(self._split("task").items()) if name}
+
+    def _split(self, key: str, first: Sequence[str] = ()) -> dict[str, EvalResult]:
+        """The episodes by a value in their details, those of the values in `first` first."""
+        parts: dict[str, list[EpisodeResult]] = {name: [] for name in first}
         for episode in self.episodes:
-            parts.setdefault(episode.detail.get("task", ""), []).append(episode)
+            parts.setdefault(episode.detail.get(key, ""), []).append(episode)
         return {
             name: replace(self, episodes=tuple(episodes))
-            for name, episodes in sorted(parts.items())
-            if name
+            for name, episodes in parts.items()
+            if episodes
         }
 
     @property
@@ -365,28 +359,6 @@ class EvalResult:
             raise ManipError(f"{path}: not an {FILE_NAME}: {why}") from error
 
 
-def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
-    """Return all episodes of the parts (name -> part), in the order of their seeds.
-
-    Raises `MismatchError` if policy or environment differ, and `ManipError` for a seed that two
-    parts ran, or for a part whose number of episodes depended on its outcomes.
-    """
-    (first, one), *others = parts.items()
-    for name, other in others:
-        # otherwise only the names show whether the policy is the same
-        known = one.policy_sha256 or other.policy_sha256
-        require_comparable(first, one, name, other, "policy_sha256" if known else "policy")
-    if stopped := next(
-        (name for name, part in parts.items() if part.until_width is not None), None
-    ):
-        raise ManipError(
-            f"{stopped} was stopped by --until_width; merge only parts with a fixed number of"
-            " episodes"
-        )
-    episodes = [episode for part in parts.values() for episode in part.episodes]
-    return replace(one, episodes=tuple(sorted(episodes, key=lambda episode: episode.seed)))
-
-
 def require_equal(left: str, one: object, right: str, other: object, *names: str) -> None:
     """Check that some attributes of two objects are equal.
 
@@ -406,9 +378,7 @@ def require_equal(left: str, one: object, right: str, other: object, *names: str
             raise MismatchError(name, left, ours, right, theirs)
 
 
-def require_comparable(
-    left: str, one: EvalResult, right: str, other: EvalResult, *more: str
-) -> None:
+def require_comparable(left: str, one: EvalResult, right: str, other: EvalResult) -> None:
     """Check that two evaluations agree in robot, task and settings.
 
     Args:
@@ -416,10 +386,9 @@ def require_comparable(
         one: The first evaluation.
         right: Name of the second evaluation, for the message.
         other: The second evaluation.
-        more: Further attributes that must agree; they are compared first.
 
     Raises:
         MismatchError: for the first difference.
     """
-    require_equal(left, one, right, other, *more, "robot", "task")
+    require_equal(left, one, right, other, "robot", "task")
     require_equal(left, one.settings, right, other.settings, *_SETTINGS)

@@ -13,12 +13,19 @@ from numpy.typing import NDArray
 from manip_il.collect.job import HOLD, RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.errors import RenderError, UsageError
-from manip_il.evaluation.figures import INK, Figure, drawing, to_figure
-from manip_il.evaluation.report import Report, Section
+from manip_il.evaluation.measuring import measure
+from manip_il.evaluation.report import (
+    INK,
+    INTERVAL,
+    Figure,
+    Report,
+    Section,
+    Table,
+    drawing,
+    to_figure,
+)
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.runner import measure
 from manip_il.evaluation.suites import read_condition
-from manip_il.evaluation.tables import CLONING, EXPERT, INTERVAL, Table
 from manip_il.option import NameOrPath
 from manip_il.progress import Progress
 from manip_il.robots.reach import reach_of
@@ -229,7 +236,7 @@ def task_table(check: RobotCheck) -> Table:
         )
         for task in check.tasks
     )
-    return Table(columns, rows, tuple(EXPERT if task.done else CLONING for task in check.tasks))
+    return Table(columns, rows)
 
 
 def _reach_figure(robot: Robot) -> Figure:

@@ -1,19 +1,14 @@
-"""Show running episodes in a window, whose sliders may drive the robot, or in Rerun, live or
-through a file.
-"""
+"""Show running episodes in a window, or write them to a file of Rerun's."""
 
-import socket
-from collections.abc import Sequence
 from pathlib import Path
 
 import rerun
 
-from manip_il.collect.rollout import Act, Turn
 from manip_il.data import schema
-from manip_il.mdp import F64, Actor, Transition
+from manip_il.mdp import Transition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import phases
-from manip_il.sim.view import Clock, Window
+from manip_il.sim.view import Window
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import env_spec
 
@@ -28,16 +23,14 @@ class WindowScreen:
 
     Args:
         env: The environment.
-        sliders: Whether the viewer's control sliders drive the robot.
 
     Raises:
         RenderError: if there is no display.
     """
 
-    def __init__(self, env: ManipEnv, *, sliders: bool = False):
+    def __init__(self, env: ManipEnv):
         self._env, self._phases = env, phases(env.scene.task)
-        self._window = Window(env.scene, env.config.control_hz, sliders=sliders)
-        self.act = slider_actions(self._window, env) if sliders else None
+        self._window = Window(env.scene, env.config.control_hz)
 
     def add(self, step: Transition) -> bool:
         """Show the world after a step, in real time; return False once the window is closed."""
@@ -56,23 +49,6 @@ class WindowScreen:
         self._window.close()
 
 
-def slider_actions(window: Window, env: ManipEnv) -> Act:
-    """Return a driver whose action (n,) is read from a window's control sliders: joint targets and
-    gripper command.
-
-    In the first step of an episode, the action is the environment's initial controls.
-    """
-
-    def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        scene, before = env.scene, env.data.ctrl
-        [turn] = turns
-        commands = before if turn.step == 0 else window.commands
-        opening = scene.gripper.commanded(commands[scene.gripper.ctrl], before[scene.gripper.ctrl])
-        return [(scene.actions.join(commands[scene.arm_ctrl], opening), Actor.LEARNER)]
-
-    return act
-
-
 def outcome(step: Transition) -> str:
     """Return how an episode ended, given its last step."""
     return (
@@ -82,44 +58,27 @@ def outcome(step: Transition) -> str:
 
 
 class RerunLog:
-    """Steps of episodes, written to a file, or sent in real time to viewers.
+    """Steps of episodes, written to a file of Rerun's.
 
     Args:
         env: The environment.
-        output: The file; None to send the steps to viewers that open `address`.
-
-    Attributes:
-        address: URL of the viewer, for a browser; empty if a file is written.
-        ports: Ports of the viewer and of the stream; (0, 0) if a file is written.
+        output: The file.
 
     Raises:
         OSError: if the file cannot be written.
     """
 
-    act = None  # a log does not drive the robot
-
-    def __init__(self, env: EnvConfig, output: Path | None = None):
-        if output:
-            # check first: rerun prints lines of its own if it cannot write
-            output.open("wb").close()
-        self._spec, self._frames = env_spec(env), 0
-        self._clock = None if output else Clock(env.control_hz)
-        self._hz = env.control_hz
+    def __init__(self, env: EnvConfig, output: Path):
+        # check first: rerun prints lines of its own if it cannot write
+        output.open("wb").close()
+        self._spec, self._frames, self._hz = env_spec(env), 0, env.control_hz
         self._stream = rerun.RecordingStream("manip_il")
-        self.address, self.ports = "", (0, 0)
-        if output:
-            self._stream.save(output)
-        else:
-            # Rerun's default ports, if they are free
-            self.ports = web, grpc = _free_port(9090), _free_port(9876)
-            uri = self._stream.serve_grpc(grpc_port=grpc)
-            rerun.serve_web_viewer(web_port=web, open_browser=False, connect_to=uri)
-            self.address = f"http://localhost:{web}/?url=rerun%2Bhttp://localhost:{grpc}/proxy"
+        self._stream.save(output)
         for name in (schema.STATE, schema.ACTION, schema.EXECUTED_ACTION):
             self._stream.log(name, rerun.SeriesLines(names=self._spec.joint_names), static=True)
 
     def add(self, step: Transition) -> bool:
-        """Send a step and, if live, wait to keep to real time. Always returns True."""
+        """Log a step; always returns True."""
         stream = self._stream
         stream.set_time("time", duration=self._frames / self._hz)
         stream.set_time(FRAME, sequence=self._frames)
@@ -142,21 +101,9 @@ class RerunLog:
             stream.log(name, rerun.Scalars(value))
         if step.done:
             stream.log("events", rerun.TextLog(outcome(step)))
-        if self._clock is not None:
-            self._clock.wait()
         return True
 
     def close(self) -> None:
-        """Write or send what is pending."""
+        """Write what is pending."""
         self._stream.flush()
         self._stream.disconnect()
-
-
-def _free_port(wanted: int) -> int:
-    """Return a free port: the wanted one if possible, else any other."""
-    try:
-        with socket.create_server(("", wanted)):
-            return wanted
-    except OSError:
-        with socket.create_server(("", 0)) as any_port:
-            return any_port.getsockname()[1]

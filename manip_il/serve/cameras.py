@@ -14,7 +14,6 @@ from manip_il.errors import UsageError
 from manip_il.serve.station import Station
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.render import Picture
 from manip_il.sim.view import Clock
 
 RATE = 30  # pictures per second
@@ -22,11 +21,7 @@ _QUALITY = 90  # JPEG quality
 
 
 class Cameras:
-    """A thread that streams a station's cameras on one port, `RATE` times per second.
-
-    Attributes:
-        images: The last picture of each camera, by its name, RGB (height, width, 3).
-    """
+    """A thread that streams a station's cameras on one port, `RATE` times per second."""
 
     def __init__(self, station: Station, cameras: CameraConfig, port: int):
         """Open the port, render the first pictures and start the stream.
@@ -41,7 +36,6 @@ class Cameras:
             RenderError: If there is no off-screen OpenGL.
         """
         self._station, self.config = station, cameras
-        self.images: dict[str, Picture] = {}
         self._data = mujoco.MjData(station.env.scene.model)
         self._socket: Any = zmq.Context.instance().socket(zmq.PUB)
         self._socket.setsockopt(zmq.SNDHWM, 2)
@@ -85,10 +79,10 @@ class Cameras:
     def _send(self) -> None:
         env = self._station.env
         self._data.qpos[:], self._data.mocap_pos[:], self._data.mocap_quat[:] = self._station.seen
-        self.images = render.pictures(env.scene, self._data, self.config, env.world.variation)
+        images = render.pictures(env.scene, self._data, self.config, env.world.variation)
         # RGB is encoded without swapping and the client's `imdecode` does not swap either, so red
         # stays red.
-        texts = {name: encode_image(image, _QUALITY) for name, image in self.images.items()}
+        texts = {name: encode_image(image, _QUALITY) for name, image in images.items()}
         self._socket.send_string(
             json.dumps({"timestamps": dict.fromkeys(texts, time.time()), "images": texts})
         )

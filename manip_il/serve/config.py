@@ -17,7 +17,6 @@ from manip_il.option import Seeded, option
 if TYPE_CHECKING:
     import numpy as np
 
-LEADERS = ("expert", "sliders", "none")  # or a policy
 # values for `--servo=ideal`
 IDEAL = {"stiffness": 100.0, "play": 0.0, "delay": 0.0, "friction": 0.0, "offset": 0.0}
 # ranges of `--vary=servo`: factors, except for delay [s] and offset [deg], which are added
@@ -67,10 +66,8 @@ class SessionConfig(Seeded):
     output_dir: Path = option(
         Path("runs/serve"), "folder of the ports follower and leader, and of their calibrations"
     )
-    leader: str = option(
-        "expert",
-        "who moves the leader arm: expert, sliders (in a window), none, or a policy (a checkpoint"
-        " or a run)",
+    leader: Literal["expert", "sliders", "none"] = option(
+        "expert", "who moves the leader arm; sliders: you, in a window"
     )
     speed: float = option(
         1.0,

@@ -9,15 +9,10 @@ import select
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 
-from manip_il.collect.drivers import policy_actions
-from manip_il.collect.rollout import Turn
 from manip_il.errors import ManipError, UsageError
-from manip_il.learn.checkpoint import Checkpoint
-from manip_il.learn.policy import LearnedPolicy
 from manip_il.mdp import F64, Actor
 from manip_il.serve.cameras import RATE, Cameras
 from manip_il.serve.config import SessionConfig
@@ -42,10 +37,7 @@ def serve(
     command: Sequence[str],
     cameras: CameraConfig | None,
     conditions: Sequence[Condition],
-    policy: Path | None,
     say: Say,
-    *,
-    trust: bool,
 ) -> None:
     """Serve a virtual arm until a program ends, or until Ctrl-C if there is none.
 
@@ -55,14 +47,10 @@ def serve(
         command: The program and its arguments; empty for none.
         cameras: The cameras to serve, if any.
         conditions: How worlds vary.
-        policy: Folder of the policy that moves the leader, if any; it must fit environment and
-            cameras.
         say: Called with lines for the user.
-        trust: Whether the policy's models and code may be loaded.
 
     Raises:
         UsageError: If the robot has no Feetech servos, or the cameras' port is taken.
-        MismatchError: If the policy does not fit.
         RenderError: If there is no display for the window, or no off-screen OpenGL for the cameras.
         ManipError: If the program failed.
     """
@@ -74,15 +62,9 @@ def serve(
             raise UsageError(f"{env_spec(env).robot} has no Feetech servos; choose another robot")
         station = Station(env_of(env, None, conditions), config)
         stack.callback(station.close)
-        shown = Cameras(station, cameras, config.camera_port) if cameras is not None else None
-        if shown is not None:
-            stack.callback(shown.close)
-        if policy is not None:
-            checkpoint = Checkpoint.open(policy)
-            checkpoint.check_fits(env_spec(env, cameras))
-            learned = LearnedPolicy.load(checkpoint, task=station.env.task_description, trust=trust)
-            leader = policy_mover(learned, station, shown)
-        elif config.leader == "sliders":
+        if cameras is not None:
+            stack.callback(Cameras(station, cameras, config.camera_port).close)
+        if config.leader == "sliders":
             leader = slider_mover(station)
         else:
             leader = station.expert if config.leader == "expert" else lambda: None
@@ -131,27 +113,6 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
         f'--dataset.single_task="{station.env.task_description}" --dataset.push_to_hub=false '
         f"--dataset.fps={station.env.config.control_hz}",
     ]
-
-
-def policy_mover(policy: LearnedPolicy, station: Station, cameras: Cameras | None) -> Mover:
-    """Return a function that moves the leader as a policy commands.
-
-    Args:
-        policy: The policy.
-        station: The station of the leader.
-        cameras: The served cameras, if any; the policy sees their latest pictures.
-    """
-    seed = None
-
-    def move() -> F64:
-        nonlocal seed
-        seen, state = station.env.observe(), station.env.get_state()
-        seen.images.update(cameras.images if cameras is not None else {})
-        turn = Turn(station.seed, state.step if seed == station.seed else 0, seen, state)
-        seed = station.seed
-        return station.to_joints(policy_actions(policy, [turn])[0])
-
-    return move
 
 
 def slider_mover(station: Station) -> Mover:

@@ -23,8 +23,19 @@ from manip_il.tasks.bins import (
 )
 from manip_il.tasks.grasp import once_per_state
 from manip_il.tasks.ladder import carry_progress, grasp_progress, grasp_rungs, is_held
-from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, observe_hand, observe_object
-from manip_il.tasks.starts import UPRIGHT, draw_few, draw_resting, draw_until, draw_yaw
+from manip_il.tasks.objects import (
+    BLUE,
+    RED,
+    UPRIGHT,
+    YELLOW,
+    add_cube,
+    draw_few,
+    draw_resting,
+    draw_until,
+    draw_yaw,
+    observe_hand,
+    observe_object,
+)
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW, "white": (0.92, 0.92, 0.90)}
 BOX = "box"

@@ -26,15 +26,18 @@ from manip_il.tasks.ladder import (
 )
 from manip_il.tasks.objects import (
     GREY,
+    UPRIGHT,
     add_cube,
     add_furniture,
     add_part,
     add_sides,
+    draw_resting,
+    draw_until,
+    draw_yaw,
     observe_hand,
     observe_object,
 )
 from manip_il.tasks.pick_place import OBJECT
-from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw
 
 CABINET = "cabinet"
 TRAY = "drawer"

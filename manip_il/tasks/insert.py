@@ -14,7 +14,19 @@ from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import lie_of, once_per_state
 from manip_il.tasks.ladder import CLOSED, nearness
-from manip_il.tasks.objects import GREY, RED, add_furniture, add_object, add_part, observe_hand
+from manip_il.tasks.objects import (
+    GREY,
+    RED,
+    add_furniture,
+    add_object,
+    add_part,
+    draw_resting,
+    draw_until,
+    draw_yaw,
+    observe_hand,
+    product,
+    turn_left,
+)
 from manip_il.tasks.peg import (
     HOLE,
     LENGTH,
@@ -32,7 +44,6 @@ from manip_il.tasks.peg import (
     peg_progress,
     upper_axis,
 )
-from manip_il.tasks.starts import draw_resting, draw_until, draw_yaw, product, turn_left
 
 MASS = 0.15  # of the peg [kg]
 DEPTH, WALL = 0.03, 0.018  # depth of the hole, and thickness of the walls around it [m]

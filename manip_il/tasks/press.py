@@ -10,8 +10,15 @@ from manip_il.robots.geometry import hand_down
 from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import World
 from manip_il.tasks.ladder import CLOSED, LiftProfile, nearness, rise_first
-from manip_il.tasks.objects import GREY, RED, add_furniture, add_part, observe_hand
-from manip_il.tasks.starts import draw_resting, draw_yaw
+from manip_il.tasks.objects import (
+    GREY,
+    RED,
+    add_furniture,
+    add_part,
+    draw_resting,
+    draw_yaw,
+    observe_hand,
+)
 
 BUTTON, CAP = "button", "cap"
 TRAVEL = 0.015  # travel of the cap [m]

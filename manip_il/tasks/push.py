@@ -13,8 +13,17 @@ from manip_il.sim.task import Observed, Rung, Start, Target, Task
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.grasp import share
 from manip_il.tasks.ladder import AT_GOAL, LiftProfile, nearness, rise_first
-from manip_il.tasks.objects import RED, add_goal, add_object, observe_hand
-from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_xy, resting_height
+from manip_il.tasks.objects import (
+    RED,
+    UPRIGHT,
+    add_goal,
+    add_object,
+    draw_resting,
+    draw_until,
+    draw_xy,
+    observe_hand,
+    resting_height,
+)
 
 PUCK = "puck"
 PUCK_SIZE = (0.03, 0.02)  # radius, half its height [m]

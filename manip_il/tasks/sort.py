@@ -33,14 +33,18 @@ from manip_il.tasks.ladder import (
 )
 from manip_il.tasks.objects import (
     BLUE,
+    FROM_HAND,
     RED,
+    UPRIGHT,
     YELLOW,
     add_cube,
     add_furniture,
+    draw_until,
+    draw_yaw,
     observe_hand,
     observe_object,
+    resting_height,
 )
-from manip_il.tasks.starts import FROM_HAND, UPRIGHT, draw_until, draw_yaw, resting_height
 
 COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW}
 BINS = {name: f"{name}_bin" for name in COLOURS}

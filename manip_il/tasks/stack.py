@@ -19,8 +19,16 @@ from manip_il.tasks.ladder import (
     is_held,
     let_go,
 )
-from manip_il.tasks.objects import BLUE, RED, add_cube, observe_hand, observe_object
-from manip_il.tasks.starts import draw_resting, draw_until, draw_yaw
+from manip_il.tasks.objects import (
+    BLUE,
+    RED,
+    add_cube,
+    draw_resting,
+    draw_until,
+    draw_yaw,
+    observe_hand,
+    observe_object,
+)
 
 TOP, BASE = "top", "base"  # the cube that is carried, and the one that it is put on
 # tolerances on the base: sideways, in height [m]; tilt [rad]

@@ -20,10 +20,9 @@ from manip_il.tasks.carry.task import Carry
 from manip_il.tasks.clear_table import ClearTable
 from manip_il.tasks.drawer import Drawer
 from manip_il.tasks.insert import Insert
-from manip_il.tasks.pick_place import Lift, PickPlace
+from manip_il.tasks.pick_place import Lift, PickPlace, ReachGoal
 from manip_il.tasks.press import Press
 from manip_il.tasks.push import Push
-from manip_il.tasks.reach import ReachGoal
 from manip_il.tasks.sort import Sort
 from manip_il.tasks.stack import Stack
 

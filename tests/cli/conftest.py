@@ -7,7 +7,7 @@ import pytest
 
 from manip_il.errors import RenderError
 from manip_il.evaluation import measuring
-from manip_il.evaluation.runner import finished_episodes
+from manip_il.evaluation.measuring import finished_episodes
 
 from .made_runs import make_policy
 

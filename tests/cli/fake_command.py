@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from manip_il.cli.progress import Stages, say
+from manip_il.cli.outputs import Stages, say
 from manip_il.errors import ManipError, UsageError
 
 

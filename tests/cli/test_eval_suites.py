@@ -1,6 +1,4 @@
-"""Suites, stopping by width, parts and their merge, resuming, and replaying one line of
-eval.json.
-"""
+"""Suites, stopping by width, resuming, and replaying one line of eval.json."""
 
 import base64
 import json
@@ -10,8 +8,8 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.errors import UsageError
+from manip_il.evaluation.measuring import EPISODES_FILE as KEPT
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.runner import EPISODES_FILE as KEPT
 from manip_il.evaluation.suites import CONDITIONS, SUITES, suite_conditions
 from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.sim.events import STANDARD
@@ -100,19 +98,6 @@ def test_until_width_stops_early(here, capsys, error):
     assert (len(result.episodes), result.until_width) == (100, 0.1)
     low, high = result.success.interval
     assert high - low <= 0.1
-
-
-def test_parts_on_seeds_of_their_own_merge_into_the_whole(here, capsys, error):
-    assert evaluate("whole", *REACH, "--eval.n_episodes=5") == 0
-    assert evaluate("a", *REACH, "--eval.n_episodes=3") == 0
-    assert evaluate("b", *REACH, "--eval.n_episodes=2", "--eval.first=3") == 0
-    assert run("eval b/eval.json a --output_dir=ab") == 0
-    assert EvalResult.read(Path("ab")) == EvalResult.read(Path("whole"))
-    assert Path("ab/report.html").is_file()
-    capsys.readouterr()
-    assert run("eval a whole --output_dir=c") == 1
-    assert "every episode needs its own seed" in error()
-    assert not Path("c").exists()
 
 
 def test_a_resumed_evaluation_is_the_whole_one(here, capsys, error):

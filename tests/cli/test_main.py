@@ -56,7 +56,7 @@ def test_the_module_runs_as_a_program():
             (
                 "manip-il: error: unknown option '--dataset.num_episods' "
                 "(did you mean '--dataset.num_episodes' or '--dataset.root'?); "
-                "manip-il fake --help=all lists all"
+                "--help lists all"
             ),
         ),
     ],

@@ -91,7 +91,7 @@ def test_words_change_what_they_name(words, change):
             [
                 "unknown option '--los'",
                 "did you mean '--loss'",
-                "manip-il COMMAND --help=all lists all",
+                "--help lists all",
             ],
         ),
         (

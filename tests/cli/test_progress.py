@@ -1,6 +1,6 @@
 import pytest
 
-from manip_il.cli.progress import progress, say, set_quiet, warn
+from manip_il.cli.outputs import progress, say, set_quiet, warn
 
 
 @pytest.fixture(autouse=True)

@@ -9,12 +9,11 @@ import pytest
 from rerun.experimental import RrdReader
 
 from manip_il.cli.main import main
-from manip_il.collect.job import RolloutJob, run_steps
+from manip_il.collect.job import RolloutJob
 from manip_il.data import schema
-from manip_il.evaluation.watch import FRAME, slider_actions
+from manip_il.evaluation.watch import FRAME
 from manip_il.mdp import Episode
 from manip_il.sim.config import CAMERAS
-from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import make_config
 
 REACH = ["view", "--task.type=reach"]
@@ -61,6 +60,7 @@ def test_a_file_holds_every_step_and_a_picture_of_every_camera(tmp_path, capsys)
         f"seed 3000000: solved, {steps[0]} steps",
         f"seed 3000001: solved, {steps[1]} steps",
         f"next: rerun {path}",
+        f"in a browser: rerun --web-viewer {path}",
     ]
     for name in (schema.STATE, schema.ACTION, schema.EXECUTED_ACTION):
         recorded = np.concatenate([episode.columns[name] for episode in episodes])
@@ -80,27 +80,3 @@ def test_a_file_holds_every_step_and_a_picture_of_every_camera(tmp_path, capsys)
         assert [bytes(np.array(one, np.uint8).ravel()[:2]) for one in pictures] == [
             b"\xff\xd8"
         ] * sum(steps)
-
-
-def test_the_sliders_of_the_window_drive_from_where_an_episode_starts():
-    class Window:
-        commands = np.zeros(0)
-
-    config = make_config("panda", "reach", horizon=30)
-    env, window = LadderEnv(config, None, ()), Window()
-    env.start(3_000_000)
-    scene, start = env.scene, env.data.ctrl.copy()
-    job = RolloutJob(config)
-    window.commands = start + 0.1
-    window.commands[scene.gripper.ctrl] = start[scene.gripper.ctrl]
-    window.commands[scene.gripper.ctrl[0]] = 0.03  # one finger: the other one follows
-    steps = list(run_steps(job, [env], [3_000_000], slider_actions(window, env)))
-    begun = steps[0].executed_action[scene.actions.arm]
-    assert not np.isclose(begun, window.commands[scene.arm_ctrl]).any()
-    np.testing.assert_allclose(
-        steps[-1].executed_action[scene.actions.arm], window.commands[scene.arm_ctrl]
-    )
-    np.testing.assert_allclose(env.data.ctrl[scene.gripper.ctrl], 0.03, atol=1e-6)
-    np.testing.assert_allclose(
-        env.data.qpos[scene.arm_q], window.commands[scene.arm_ctrl], atol=5e-3
-    )

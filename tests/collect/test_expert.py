@@ -16,7 +16,7 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.world import GOAL, Scene, World
-from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.objects import UPRIGHT
 from manip_il.tasks.table import get_task
 from manip_il.worlds.ladder.world import scene_of
 from manip_il.worlds.table import make_config, make_env

@@ -49,7 +49,6 @@ OF_COMMAND: dict[str, Sizes] = {
     "rl ppo": {"episodes": 2, "episode_steps": 20, "ppo.minibatches": 2, "ppo.epochs": 1},
     # diffusion cuts out 84 x 84 pixels
     "data redraw": {"frames": 30, "image.height": 96, "image.width": 96},
-    # a viewer that is served lives as long as its process, which runs all the lines
     "view": {"output": "seen.rrd"},
 }
 OF_POLICY: dict[str, Sizes] = {

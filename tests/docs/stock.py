@@ -33,9 +33,6 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
         "reward fit pairs.json preferences.json --sources=runs/dagger --output_dir=runs/reward"
     ),
     "runs/eval": f"{_EXPERT} --output_dir=runs/eval",
-    "out/0": f"{_EXPERT} --eval.first=0 --output_dir=out/0",
-    "out/1": f"{_EXPERT} --eval.first=2 --output_dir=out/1",
-    "out/2": f"{_EXPERT} --eval.first=4 --output_dir=out/2",
 }
 # what a file names, and a command that is given the file reads
 READ_BY = {"pairs.json": "runs/dagger"}

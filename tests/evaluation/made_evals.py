@@ -3,14 +3,9 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from manip_il.evaluation.comparison import Study
-from manip_il.evaluation.film import encode_mp4
-from manip_il.evaluation.report import Film
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
-from manip_il.evaluation.rounds import Rule, history
-from manip_il.evaluation.side import Member, Side
+from manip_il.evaluation.side import Member, Rule, Side, history
 
 from .test_rounds import records
 
@@ -71,11 +66,3 @@ def made_side(
         for i, one in enumerate(results)
     )
     return Side(name, tuple(members))
-
-
-def small_film(number: int) -> Film:
-    """A second of a square that wanders."""
-    frames = np.full((12, 48, 64, 3), 230, dtype=np.uint8)
-    for index, frame in enumerate(frames):
-        frame[10:30, 4 * index : 4 * index + 14] = (200, 40 * number % 255, 60)
-    return Film("policy", encode_mp4(list(frames), 12), f"seed {FIRST_SEED + number}")

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from manip_il.evaluation.rounds import Rule, history
+from manip_il.evaluation.side import Rule, history
 
 SUCCESS = (0.5, 0.9, 0.8, 0.9, 0.7)
 

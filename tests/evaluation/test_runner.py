@@ -9,9 +9,9 @@ import pytest
 from manip_il.collect.drivers import PolicyDriver, RandomDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
-from manip_il.evaluation import runner
+from manip_il.evaluation import measuring
+from manip_il.evaluation.measuring import measure
 from manip_il.evaluation.results import EpisodeResult, EvalResult
-from manip_il.evaluation.runner import measure
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.progress import Progress
 from manip_il.seeding import stream_seeds
@@ -100,7 +100,7 @@ def coins(monkeypatch):
 
     def make(outcomes: list[bool]) -> Coins:
         monkeypatch.setattr(
-            runner, "episode_result", lambda job, one: result(one.seed, outcomes[one.seed])
+            measuring, "episode_result", lambda job, one: result(one.seed, outcomes[one.seed])
         )
         return Coins()
 
@@ -119,8 +119,8 @@ def test_until_width_stops_at_the_first_look_that_is_narrow_enough(coins):
     found = evaluate(engine, COIN, range(10_000), "coin", until_width=0.05)
     low, high = found.success.interval
     assert high - low <= 0.05
-    assert len(found.episodes) % runner.CHECK_EVERY == 0
-    shorter = replace(found, episodes=found.episodes[: -runner.CHECK_EVERY])
+    assert len(found.episodes) % measuring.CHECK_EVERY == 0
+    shorter = replace(found, episodes=found.episodes[: -measuring.CHECK_EVERY])
     assert shorter.success.interval[1] - shorter.success.interval[0] > 0.05
     assert [episode.seed for episode in found.episodes] == list(range(len(found.episodes)))
     assert max(map(max, engine.asked)) == len(found.episodes) - 1  # nothing beyond it was run

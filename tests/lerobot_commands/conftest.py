@@ -14,8 +14,8 @@ from manip_il.cli.main import main
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
+from manip_il.evaluation.measuring import episode_result
 from manip_il.evaluation.results import EpisodeResult
-from manip_il.evaluation.runner import episode_result
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig

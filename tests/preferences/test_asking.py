@@ -57,6 +57,7 @@ def saved(window: Opened, pairs: Pairs, folder: Path) -> Preferences:
     return Preferences.read(folder / "preferences.json", [pairs])
 
 
+@pytest.mark.system
 def test_keys_answer_undo_and_skip_and_the_download_is_what_fit_reads(
     browser, page, pairs, tmp_path
 ):

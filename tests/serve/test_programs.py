@@ -174,15 +174,12 @@ def pictures(port: int, horizon: int) -> tuple[str, ...]:
     return ("--cameras=front", *sizes, f"--camera_port={port}")
 
 
-@pytest.mark.gl
-def test_a_policy_at_the_leader_drives_whoever_follows_it(run: Run, policy: str):
-    """It gives the task and the cameras; twice as fast as real time twice as many attempts end."""
-    served = (f"--leader={policy}", "--camera_port=5634", "--env.horizon=30", "--speed=2")
+def test_attempts_follow_each_other_while_a_program_teleoperates(run: Run):
+    """Twice as fast as real time, twice as many end."""
+    served = ("--env.horizon=30", "--speed=2")
     logged = run("lerobot-teleoperate", "--fps=60", "--teleop_time_s=5", served=served)
     assert len(logged) >= 3
-    assert {*np.concatenate([one.columns["actor"] for one in logged]).ravel()} == {Actor.LEARNER}
-    first = logged[0].columns["executed_action"]
-    assert np.abs(first - first[0]).max() > 0.01
+    assert {*np.concatenate([one.columns["actor"] for one in logged]).ravel()} == {Actor.EXPERT}
 
 
 @pytest.mark.gl

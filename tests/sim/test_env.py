@@ -13,7 +13,7 @@ from manip_il.sim.config import DT_SIM
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import GOAL
 from manip_il.tasks import ENV_IDS, TASK_IDS, register_envs
-from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.objects import UPRIGHT
 from manip_il.tasks.table import TASKS
 from manip_il.worlds.ladder.world import make_env
 

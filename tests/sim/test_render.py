@@ -15,7 +15,7 @@ from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.world import GOAL
-from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.objects import UPRIGHT
 from manip_il.worlds.ladder.world import scene_of
 
 from ..scenes import SEED, started

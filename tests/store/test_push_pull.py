@@ -17,7 +17,7 @@ from manip_il.bridges.store.manifest import MANIFEST_FILE
 from manip_il.bridges.store.objects import Objects
 from manip_il.bridges.store.transfer import open_remote, pull, push
 from manip_il.data.dataset import Dataset
-from manip_il.errors import FolderExistsError, ManipError, UsageError
+from manip_il.errors import FolderExistsError, ManipError
 
 from ..learn.tiny_policies import write_checkpoint
 from .conftest import DATASET, POLICY, SAMPLE, content, make_run
@@ -81,29 +81,6 @@ def test_s3_itself_refuses_a_manifest_that_replaces_another_than_was_read(
     monkeypatch.setattr(remote, "read", lambda: next(answers))
     with pytest.raises(RemoteError, match="changed by another push"):
         remote._switch(older, older.version)
-
-
-def test_journals_go_along_when_asked_and_lie_beside_again(tmp_path: Path):
-    root, url = shutil.copytree(SAMPLE, tmp_path / "d"), f"file://{tmp_path}/store"
-    (tmp_path / "d.journals").mkdir()
-    (tmp_path / "d.journals" / "seed_000000000001.mcap").write_bytes(b"of an episode")
-    (tmp_path / "d.journals" / "recording.json").write_text('{"only_successes": true}')
-    for asked in (False, True):
-        push(root, open_quietly(url), journals=asked)
-        pull(open_quietly(url), tmp_path / "got", overwrite=True)
-        assert content(tmp_path / "got") == content(root)
-        assert (tmp_path / "got.journals").exists() == asked
-    assert content(tmp_path / "got.journals") == content(tmp_path / "d.journals")
-    shutil.rmtree(tmp_path / "got")  # as a kill between the two renames leaves it
-    pull(open_quietly(url), tmp_path / "got")
-    # so that nothing says that they are ours
-    (tmp_path / "got.journals" / "recording.json").unlink()
-    (tmp_path / "got.journals" / "thesis.tex").touch()
-    before = content(tmp_path)
-    for overwrite in (False, True):
-        with pytest.raises(UsageError):
-            pull(open_quietly(url), tmp_path / "got", overwrite=overwrite)
-    assert content(tmp_path) == before
 
 
 def test_a_store_of_the_version_before_is_read_and_what_nobody_needs_removed(tmp_path: Path):

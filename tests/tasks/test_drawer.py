@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from manip_il.tasks.drawer import CABINET, OBJECT
-from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.objects import UPRIGHT
 
 from ..scenes import solve, started
 

@@ -21,7 +21,7 @@ from manip_il.sim.scene import Scene
 from manip_il.sim.task import NO_PHASE, phases
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks import NAMES
-from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.objects import UPRIGHT
 from manip_il.tasks.table import TASKS
 from manip_il.worlds.ladder import world
 from manip_il.worlds.ladder.world import make_env, scene_of

@@ -15,9 +15,8 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.env import environment_state_names
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import Lie, lie_of
-from manip_il.tasks.objects import observe_object
+from manip_il.tasks.objects import UPWARDS, observe_object, product, turn_left
 from manip_il.tasks.pick_place import OBJECT
-from manip_il.tasks.starts import UPWARDS, product, turn_left
 from manip_il.worlds.ladder.world import make_env
 from manip_il.worlds.table import make_config
 

@@ -14,8 +14,8 @@ from manip_il.mdp import State
 from manip_il.sim.env import environment_state_names
 from manip_il.sim.events import move_object
 from manip_il.sim.world import World
+from manip_il.tasks.objects import UPRIGHT
 from manip_il.tasks.sort import BINS, COLOURS, PITCH, SENTENCES, asked
-from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
 from manip_il.worlds.ladder.world import make_env
 from manip_il.worlds.table import make_config

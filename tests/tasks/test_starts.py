@@ -12,7 +12,7 @@ from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.task import Start
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.starts import FROM_HAND, FROM_HAND_SHARE
+from manip_il.tasks.objects import FROM_HAND, FROM_HAND_SHARE
 from manip_il.tasks.table import TASKS, get_task
 from manip_il.worlds.ladder.world import make_env, scene_of
 

@@ -13,7 +13,7 @@ import pytest
 from manip_il.collect.drivers import ExpertDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.evaluation.runner import episode_hold, positions
+from manip_il.evaluation.measuring import episode_hold, positions
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds

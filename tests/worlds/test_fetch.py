@@ -9,7 +9,7 @@ import pytest
 from manip_il.collect.drivers import Driver, ExpertDriver, NoisyExpertDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.errors import MismatchError
-from manip_il.evaluation.runner import positions
+from manip_il.evaluation.measuring import positions
 from manip_il.evaluation.world_check import check_world
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options

@@ -1,7 +1,4 @@
-"""The files of one version of a dataset or run, with sizes and hashes.
-
-`Arrival` counts their bytes as they are downloaded.
-"""
+"""The files of one version of a dataset or run, with sizes and hashes."""
 
 from __future__ import annotations
 
@@ -12,17 +9,14 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, override
-
-from fsspec.callbacks import Callback
+from typing import Literal
 
 from manip_il import checks
 from manip_il.bridges.store.errors import RemoteError
-from manip_il.data.journal import journals_of
 from manip_il.data.lerobot_layout import INFO
 
 MANIFEST_FILE = "manip_il_manifest.json"
-JOURNALS = "journals"  # name of a folder of journals, in a pushed dataset or anywhere in a run
+JOURNALS = "journals"  # name of a folder of journals in a run, which are not pushed
 # the link `last` to the newest checkpoint is not pushed; a pull creates it
 CHECKPOINTS, LAST = "checkpoints", "last"
 # the first once per repository, the second once per policy
@@ -153,34 +147,6 @@ class PushPlan:
     remove: list[str]
 
 
-class Arrival(Callback):
-    """Counts the bytes of one file. Raises `RemoteError` as soon as they are more than `most`.
-
-    fsspec updates it as a callback. huggingface_hub calls it for a new progress bar, and updates
-    that.
-    """
-
-    def __init__(self, most: int):
-        super().__init__()
-        self.most = most
-
-    @override
-    def call(self, *hook: Any, **given: Any) -> None:
-        """Raise `RemoteError` if there are too many bytes."""
-        if self.value > self.most:
-            raise RemoteError(
-                f"it sends more than the {self.most:,} bytes that were expected; nothing was kept"
-            )
-
-    def __call__(self, *given: Any, **options: Any) -> Arrival:
-        """Return the bar, for huggingface_hub."""
-        return self
-
-    def update(self, count: float | None = 1) -> None:
-        """Count more bytes."""
-        self.relative_update(int(count or 0))
-
-
 def check_path(path: object) -> None:
     """Raise `RemoteError` for a path that leads outside its folder, is hidden, or is not of a
     known kind of data.
@@ -202,16 +168,13 @@ def check_path(path: object) -> None:
         )
 
 
-def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, Path]:
+def list_files(root: Path) -> dict[str, Path]:
     """Return the files of a dataset or run by their paths in the manifest.
 
-    Hidden and unfinished files are left out.
+    Hidden and unfinished files, and journals, are left out.
 
     Args:
         root: Folder of the dataset or run.
-        kind: Which of them it is.
-        journals: Whether to include a dataset's `<root>.journals`, as `journals/`, and the journals
-            in a run.
 
     Raises:
         RemoteError: for a link, unless it is a run's link to its last checkpoint.
@@ -219,7 +182,7 @@ def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, P
     local: dict[str, Path] = {}
     for path in sorted(root.rglob("*")):
         parts = path.relative_to(root).parts
-        if any(map(_LEFT_OUT.fullmatch, parts)) or (JOURNALS in parts[:-1] and not journals):
+        if any(map(_LEFT_OUT.fullmatch, parts)) or JOURNALS in parts[:-1]:
             continue
         if path.is_symlink():
             if parts[-2:] != (CHECKPOINTS, LAST):
@@ -228,8 +191,6 @@ def list_files(root: Path, kind: Kind, *, journals: bool = False) -> dict[str, P
                 )
         elif path.is_file():
             local["/".join(parts)] = path
-    if journals and kind == "dataset" and (beside := journals_of(root)).is_dir():
-        local |= {f"{JOURNALS}/{name}": path for name, path in list_files(beside, kind).items()}
     return local
 
 

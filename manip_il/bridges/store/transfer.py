@@ -4,7 +4,6 @@ A push is checked first and is visible only when complete; a pull is verified, a
 appears in one rename.
 """
 
-import filecmp
 import re
 import shutil
 import tempfile
@@ -22,7 +21,6 @@ from manip_il.bridges.store.hub import Hub
 from manip_il.bridges.store.manifest import (
     CARD,
     CHECKPOINTS,
-    JOURNALS,
     LAST,
     File,
     Kind,
@@ -33,9 +31,8 @@ from manip_il.bridges.store.manifest import (
 )
 from manip_il.bridges.store.objects import Objects
 from manip_il.data import atomic
-from manip_il.data.atomic import DATASET, EPISODES, POLICY, kind_of, output_of
+from manip_il.data.atomic import DATASET, POLICY, kind_of, output_of
 from manip_il.data.gate import check_arrived
-from manip_il.data.journal import journals_of
 from manip_il.data.lerobot_layout import INFO
 from manip_il.errors import ManipError, UsageError
 
@@ -72,15 +69,12 @@ def open_remote(
     return Objects(found[1], url, quiet=quiet)
 
 
-def push(
-    source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run: bool = False
-) -> PushPlan:
-    """Push a folder; return the differences.
+def push(source: Path, remote: Hub | Objects, *, dry_run: bool = False) -> PushPlan:
+    """Push a folder without its journals; return the differences.
 
     Args:
         source: A dataset, run or policy.
         remote: Where to.
-        journals: Push journals, too.
         dry_run: Push nothing.
 
     Raises:
@@ -102,7 +96,7 @@ def push(
             text = f"{dataset} is damaged and was not pushed: {errors[0]}"
             raise ManipError(f"{text}; see all errors with manip-il data check {dataset}")
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
-        local = list_files(source.absolute(), kind, journals=journals)
+        local = list_files(source.absolute())
         old = pushed = before.files if before else {}
         if isinstance(remote, Hub):  # other remotes hold the folder unchanged, and nothing else
             pushed = remote.pushed(before) if before else {}
@@ -166,21 +160,7 @@ def pull(
             steps = [path.name for path in checkpoints.iterdir() if path.name.isdecimal()]
             if steps and not (checkpoints / LAST).exists():
                 (checkpoints / LAST).symlink_to(max(steps, key=int))
-        journals = partial / JOURNALS
-        if manifest.kind == "dataset" and journals.is_dir():
-            _place_journals(journals, journals_of(target), EPISODES if overwrite else "")
     return manifest
-
-
-def _place_journals(arrived: Path, beside: Path, replaces: str) -> None:
-    """Move a dataset's journals beside it, unless they are there, as a killed pull leaves them."""
-    if beside.is_dir():
-        found = filecmp.dircmp(arrived, beside, ignore=[])
-        if not (found.left_only or found.right_only or found.diff_files):
-            shutil.rmtree(arrived)
-            return
-    with atomic.new_folder(beside, replaces=replaces) as folder:
-        arrived.rename(folder)
 
 
 def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest) -> None:

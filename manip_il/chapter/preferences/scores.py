@@ -26,7 +26,7 @@ from scipy.stats import mannwhitneyu
 from manip_il.chapter.preferences.pairs import Frames
 from manip_il.data.atomic import writing
 from manip_il.data.lerobot_layout import EPISODE_INDEX
-from manip_il.evaluation.tables import Table
+from manip_il.evaluation.report import Table
 from manip_il.mdp import F64
 
 FILE_NAME, WEIGHTS_FILE = "scores.json", "rabc.parquet"

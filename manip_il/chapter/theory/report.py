@@ -9,10 +9,19 @@ import numpy as np
 from manip_il.chapter.theory.bounds import DRAWS, ERROR, PROCESSES, LossCurve
 from manip_il.chapter.theory.linear import GUST, OPEN_LOOPS, Drift
 from manip_il.chapter.theory.shift import WRONG, RoundShift, Shift
-from manip_il.evaluation.figures import CLONING, COLOURS, DAGGER, SOFT, Figure, drawing, to_figure
 from manip_il.evaluation.intervals import format_percent
-from manip_il.evaluation.report import Report, Section
-from manip_il.evaluation.tables import Table
+from manip_il.evaluation.report import (
+    CLONING,
+    COLOURS,
+    DAGGER,
+    SOFT,
+    Figure,
+    Report,
+    Section,
+    Table,
+    drawing,
+    to_figure,
+)
 
 FILE_NAME = "theory.json"
 _LOOKS = {"cloning": (CLONING, "o"), "DAgger": (DAGGER, "s")}

@@ -42,8 +42,7 @@ from manip_il.cli.chapter import (
     TheoryOptions,
 )
 from manip_il.cli.data import ScoreOptions
-from manip_il.cli.outputs import publish
-from manip_il.cli.progress import progress, say
+from manip_il.cli.outputs import progress, publish, say
 from manip_il.data.atomic import write_file, write_json
 from manip_il.data.dataset import Dataset
 from manip_il.evaluation.certify import certify, count_episodes
@@ -107,10 +106,10 @@ def run_fit(options: FitOptions) -> None:
 def run_irl(options: IrlOptions) -> None:
     """Read, learn, write the reward and the report, print the weights."""
     with progress(None, f"irl {options.dataset}") as bar:
-        carried = inverse.read_carried(options.dataset, bar.step)
+        shown = inverse.read_carried(options.dataset, bar.step)
     rng = rng_for(stream_base("training", options.seed), "irl")
-    learnt = learn(options.method, [one.demonstration for one in carried], rng)
-    found = inverse.Inverse(str(options.dataset), tuple(carried), learnt)
+    learnt = learn(options.method, shown, rng)
+    found = inverse.Inverse(str(options.dataset), tuple(shown), learnt)
     with options.open() as folder:
         page = inverse.inverse_report(found)
         publish(

@@ -24,8 +24,7 @@ from manip_il.cli.data import (
     RenderOptions,
     RepairOptions,
 )
-from manip_il.cli.outputs import require_writable
-from manip_il.cli.progress import progress, say, warn
+from manip_il.cli.outputs import progress, require_writable, say, warn
 from manip_il.collect.edits import (
     CHUNK,
     EditSource,

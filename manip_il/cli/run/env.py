@@ -1,6 +1,6 @@
 """Run `manip-il env check`."""
 
-from manip_il.cli.progress import progress, say
+from manip_il.cli.outputs import progress, say
 from manip_il.cli.robots import EnvCheckOptions
 from manip_il.collect.inputs import env_config
 from manip_il.errors import ManipError

@@ -5,38 +5,34 @@ import tempfile
 from pathlib import Path
 
 from manip_il.cli.evaluate import EvalOptions
-from manip_il.cli.outputs import OutputFile, about, publish
-from manip_il.cli.progress import Stages, say, say_next, warn
+from manip_il.cli.outputs import OutputFile, Stages, about, say, say_next
 from manip_il.collect.inputs import path_options
 from manip_il.collect.workers import default_workers
 from manip_il.data.atomic import write_file
-from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.eval_report import condition_sides, eval_report, success_table
+from manip_il.evaluation.eval_report import condition_sides, success_table
 from manip_il.evaluation.film import film_episode
 from manip_il.evaluation.measuring import evaluate, replay
 from manip_il.evaluation.report import REPORT_FILE
-from manip_il.evaluation.results import FILE_NAME, EvalResult, merge_results
+from manip_il.evaluation.results import FILE_NAME
 from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, CameraConfig
 from manip_il.worlds.ladder.world import make_env
 
 
 def run_eval(options: EvalOptions) -> None:
-    """Evaluate, write `eval.json` and `report.html`, print the table; or check, replay or merge."""
+    """Evaluate, write `eval.json` and `report.html`, print the table; or check, or replay."""
     match options.evaluation, options.replay:
         case _ if options.health:
             say(f"healthy: {machine()}")
-        case [file], int(seed):
+        case Path() as file, int(seed):
             _replay(options, file, seed)
-        case [_, _, *_], None:
-            _merge(options)
-        case [], None if (options.policy.path is None) != (options.policy.type is None):
+        case None, None if (options.policy.path is None) != (options.policy.type is None):
             _evaluate(options)
-        case [], None:
+        case None, None:
             raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
         case _:
-            raise UsageError("expected two or more evaluations to merge, or one and --replay=SEED")
+            raise UsageError("EVALUATION and --replay=SEED belong together; give both")
 
 
 def _evaluate(options: EvalOptions) -> None:
@@ -54,7 +50,6 @@ def _evaluate(options: EvalOptions) -> None:
             kind=policy.type or "expert",
             suite=options.suite,
             stream=how.stream,
-            first=how.first,
             seed=options.seed,
             hold=how.hold,
             until_width=options.until_width,
@@ -73,19 +68,6 @@ def _evaluate(options: EvalOptions) -> None:
     words = [] if policy.path is None else [f"--policy.path={policy.path}"]
     words += path_options(options.env)
     say_next("eval", folder, *words, f"--replay={seed}", "--video=replay.mp4")
-
-
-def _merge(options: EvalOptions) -> None:
-    """Merge evaluations; warn if they were made with different versions or models."""
-    parts = {str(path): EvalResult.read(path) for path in options.evaluation}
-    merged, ((first, one), *others) = merge_results(parts), parts.items()
-    for name, other in others:
-        warn(*compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
-    with options.open() as folder:
-        tables = [success_table(condition_sides(merged))]
-        publish(
-            folder / FILE_NAME, merged.to_json(), tables, page=eval_report(merged), options=options
-        )
 
 
 def _replay(options: EvalOptions, file: Path, seed: int) -> None:

@@ -19,9 +19,8 @@ from manip_il.algorithms.run import Run
 from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.evaluate import CompareOptions, ComparisonOptions, StudyFile
 from manip_il.cli.imitation import DaggerOptions, DemoOptions
-from manip_il.cli.outputs import about, publish
+from manip_il.cli.outputs import Stages, about, publish, say, say_next, warn
 from manip_il.cli.parsing import Open, from_layers, from_yaml
-from manip_il.cli.progress import Stages, say, say_next, warn
 from manip_il.collect.inputs import env_config, path_options
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import parse_query
@@ -31,12 +30,11 @@ from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.evaluation.comparison import FILE_NAME, Comparison, Study
 from manip_il.evaluation.eval_report import compare_report, run_report, success_table
 from manip_il.evaluation.film import collect_films, film_episode, run_states
-from manip_il.evaluation.measuring import measure_sides, open_driver
+from manip_il.evaluation.measuring import episode_hold, measure_sides, open_driver
 from manip_il.evaluation.report import REPORT_FILE, Film
-from manip_il.evaluation.rounds import Rule
-from manip_il.evaluation.runner import episode_hold
 from manip_il.evaluation.side import (
     Member,
+    Rule,
     Side,
     read_member,
     read_side,
@@ -45,7 +43,6 @@ from manip_il.evaluation.side import (
     select_rounds,
 )
 from manip_il.evaluation.suites import varied
-from manip_il.evaluation.tables import CLONING, DAGGER, EXPERT
 from manip_il.learn.checkpoint import Checkpoint, policy_folder
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import MLP
@@ -141,7 +138,7 @@ def run_demo(options: DemoOptions) -> None:
     kept = f"every finished episode, round and evaluation, in {options.output_dir}"
     with options.open() as folder, Stages(kept) as stages, options.open_engine() as engine:
         sides = _measure(options, config, folder, engine, stages)
-        films, no_films = _film(sides, config, stages)
+        films = _film(sides, config, stages)
     disturbed = [Side.of(side.name, side.disturbed) for side in sides if side.disturbed]
     verdict, *facts = (
         prefix + Comparison(tested[place], tested[-1]).verdict
@@ -155,7 +152,6 @@ def run_demo(options: DemoOptions) -> None:
         sides,
         [Side("DAgger", (read_member(folder / "dagger"),))],
         films,
-        no_films,
         title=f"Demo: {config.env.robot} {config.env.task}",
         verdict=verdict,
         facts=tuple(facts),
@@ -186,15 +182,12 @@ def _measure(
     more = run.demonstrations(math.ceil(ENOUGH * config.demonstrations * most / first.labels))
     policy = run.fit([more]).path
     contestants = (
-        ("expert", None, None, EXPERT),
-        ("cloning", first.policy, first.labels, CLONING),
-        ("cloning with as many labels", policy, more.labels, CLONING),
-        (f"DAgger (round {best.number})", best.policy, best.labels, DAGGER),
+        ("expert", None, None),
+        ("cloning", first.policy, first.labels),
+        ("cloning with as many labels", policy, more.labels),
+        (f"DAgger (round {best.number})", best.policy, best.labels),
     )
-    sides = [
-        Side(name, (Member(Path(name), policy=path),), colour, n)
-        for name, path, n, colour in contestants
-    ]
+    sides = [Side(name, (Member(Path(name), policy=path),), n) for name, path, n in contestants]
     envs = dict.fromkeys((side.name for side in sides), config.env)
     nominal, disturbed = (
         measure_sides(
@@ -218,7 +211,7 @@ def _measure(
     ]
 
 
-def _film(sides: Sequence[Side], config: RunConfig, stages: Stages) -> tuple[list[Film], str]:
+def _film(sides: Sequence[Side], config: RunConfig, stages: Stages) -> list[Film]:
     """Film every policy on the first seed on which DAgger succeeds and cloning fails, else on
     the first seed.
     """

@@ -10,8 +10,7 @@ from manip_il.chapter.config import LearningConfig
 from manip_il.chapter.learning import LearningRun
 from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.chapter import GailOptions, Learning, PpoOptions
-from manip_il.cli.outputs import about
-from manip_il.cli.progress import Stages, say
+from manip_il.cli.outputs import Stages, about, say
 from manip_il.cli.run.imitation import say_best
 from manip_il.collect.inputs import open_dataset
 from manip_il.learn.checkpoint import Origin, find_policy
@@ -21,10 +20,9 @@ from manip_il.worlds.table import env_spec, stored_config
 
 
 def _run(options: Learning, config: LearningConfig) -> None:
-    """Run all iterations, or continue them, and write the report."""
+    """Run all iterations, and write the report."""
     with options.open() as folder:
-        kept = f"every finished iteration, in {folder}"
-        with Stages(kept) as stages, options.open_engine() as engine:
+        with Stages() as stages, options.open_engine() as engine:
             stages.start(f"{options.method.upper()}, steps", config.steps)
             for result in LearningRun(config, folder, engine).results():
                 stages.log({"step": result.steps} | result.metrics)

@@ -3,8 +3,7 @@
 from manip_il.bridges.mcap.export import export_dataset, left_out
 from manip_il.bridges.mcap.importing import import_files, list_files
 from manip_il.bridges.mcap.mapping import load_mapping
-from manip_il.cli.outputs import prepare_output, save_options
-from manip_il.cli.progress import progress, say
+from manip_il.cli.outputs import prepare_output, progress, save_options, say
 from manip_il.cli.transfer import McapExportOptions, McapImportOptions
 from manip_il.data.atomic import new_folder, output_of
 from manip_il.data.dataset import Dataset

@@ -6,9 +6,8 @@ from pathlib import Path
 from manip_il import checks
 from manip_il.bridges.doctor.models import MODELS
 from manip_il.cli.imitation import RecordOptions
-from manip_il.cli.outputs import locked
+from manip_il.cli.outputs import Stages, locked, say, say_next
 from manip_il.cli.parsing import Given
-from manip_il.cli.progress import Stages, say, say_next
 from manip_il.collect.inputs import env_config
 from manip_il.collect.record import record
 from manip_il.data.atomic import DATASET, EPISODES

@@ -3,8 +3,7 @@
 import os
 
 from manip_il import checks
-from manip_il.cli.outputs import OutputFile, publish
-from manip_il.cli.progress import progress, say
+from manip_il.cli.outputs import OutputFile, progress, publish, say
 from manip_il.cli.robots import (
     CertifyOptions,
     RobotCheckOptions,

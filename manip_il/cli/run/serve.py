@@ -1,17 +1,14 @@
 """Run `manip-il serve`: a virtual SO-101 behind serial ports, for LeRobot's own programs."""
 
 from dataclasses import replace
-from pathlib import Path
 
-from manip_il.cli.outputs import save_options
-from manip_il.cli.progress import say
+from manip_il.cli.outputs import save_options, say
 from manip_il.cli.robots import ServeOptions
+from manip_il.collect.inputs import env_config
 from manip_il.data.atomic import exclusive, output_of, require_ours
 from manip_il.errors import UsageError
-from manip_il.evaluation.measuring import open_driver
 from manip_il.evaluation.suites import varied
-from manip_il.learn.checkpoint import find_policy
-from manip_il.serve.config import LEADERS, SessionConfig
+from manip_il.serve.config import SessionConfig
 from manip_il.serve.session import serve
 from manip_il.sim.view import has_display
 
@@ -22,13 +19,10 @@ _IDLE = ("late", "random_actions", "dynamics")  # conditions that do not affect 
 
 def run_serve(options: ServeOptions) -> None:
     """Serve until the program ends or the user presses Ctrl-C."""
-    leader, policy = options.session.get("leader", LEADERS[0]), None
-    if leader not in LEADERS:
-        policy = find_policy(Path(leader).expanduser())
-    if leader == "sliders" and not has_display():
+    if options.session.get("leader") == "sliders" and not has_display():
         raise UsageError("--leader=sliders opens a window, which needs a display; set DISPLAY")
-    env, _, seen = open_driver(policy, options.env, trust=options.trust)
-    cameras = options.camera_config(env) if options.cameras else seen
+    env = env_config(options.env)
+    cameras = options.camera_config(env) if options.cameras else None
     if idle := [one for one in options.vary if one in _IDLE]:
         raise UsageError(
             f"--vary={idle[0]} changes nothing for a served arm; use --servos.*, or --vary=servo"
@@ -40,4 +34,4 @@ def run_serve(options: ServeOptions) -> None:
     with exclusive(session.output_dir):
         require_ours(session.output_dir, output_of("Serve"))
         save_options(session.output_dir, replace(options, command=[]))  # which may hold secrets
-        serve(env, session, options.command, cameras, conditions, policy, say, trust=options.trust)
+        serve(env, session, options.command, cameras, conditions, say)

@@ -1,11 +1,19 @@
-"""Run `manip-il train`: behaviour cloning on datasets, with our policies and LeRobot's."""
+"""Run `manip-il train`: behaviour cloning on datasets, with our policies and LeRobot's.
+
+Run `manip-il export`: a policy as one ONNX file.
+"""
 
 import contextlib
 import os
 
 from manip_il.cli.imitation import RANK, TrainOptions
-from manip_il.cli.progress import Stages, say, say_next, set_quiet
+from manip_il.cli.outputs import Stages, say, say_next, set_quiet
+from manip_il.cli.transfer import ExportOptions
 from manip_il.collect.inputs import open_dataset, own_files, why_not_simulated
+from manip_il.data.atomic import write_file
+from manip_il.errors import ManipError
+from manip_il.learn.checkpoint import find_policy, read_config
+from manip_il.learn.export import export_onnx
 from manip_il.learn.train import train
 
 
@@ -48,3 +56,25 @@ def run_train(options: TrainOptions) -> None:
     else:
         words = own_files(first.spec, first.spec.object)
         say_next("eval", path, *words, f"--output_dir={folder}/eval")
+
+
+EXPORTABLE = ("mlp", "cnn")
+
+
+def run_export(options: ExportOptions) -> None:
+    """Export, compare, write."""
+    options.check()
+    path = find_policy(options.policy)
+    if (kind := read_config(path)["type"]) not in EXPORTABLE:
+        raise ManipError(
+            f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported"
+        )
+    try:
+        content, difference = export_onnx(path)
+    except ImportError as error:
+        raise ManipError(
+            f"an ONNX file needs {error.name}: pip install 'manip_il[export]'"
+        ) from error
+    write_file(options.output, content)
+    say(f"largest difference from {path} over random observations: {difference:.1e}")
+    say(f"exported: {options.output} ({len(content):,} bytes)")

@@ -3,7 +3,7 @@
 from rich import filesize
 
 from manip_il.bridges.store.transfer import open_remote, pull, push
-from manip_il.cli.progress import has_bars, say, say_next
+from manip_il.cli.outputs import has_bars, say, say_next
 from manip_il.cli.transfer import (
     PullOptions,
     PushOptions,
@@ -13,7 +13,7 @@ from manip_il.cli.transfer import (
 def run_push(options: PushOptions) -> None:
     """Check, list, upload, switch to the new version; print what was done."""
     remote = open_remote(options.remote, private=options.private, quiet=not has_bars())
-    plan = push(options.source, remote, journals=options.journals, dry_run=options.dry_run)
+    plan = push(options.source, remote, dry_run=options.dry_run)
     size = filesize.decimal(sum(plan.manifest.files[path].size for path in plan.upload))
     if options.dry_run:
         say(

@@ -1,24 +1,17 @@
-"""Run `manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun if there is no
-display.
-"""
+"""Run `manip-il view`: a robot at its task, in MuJoCo's viewer or in a file of Rerun's."""
 
 import contextlib
-import socket
-from dataclasses import replace
 from typing import Any
 
 from manip_il.cli.common_options import default_cameras
-from manip_il.cli.progress import say
+from manip_il.cli.outputs import say
 from manip_il.cli.robots import IN_A_FILE, ViewOptions
 from manip_il.collect.job import HOLD, RolloutJob, observed_cameras, run_steps
-from manip_il.errors import UsageError
 from manip_il.evaluation.measuring import open_driver
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.evaluation.watch import RerunLog, WindowScreen, outcome
 from manip_il.seeding import BLOCK, stream_seeds
-from manip_il.sim.config import FILM, LONGEST_EPISODE, CameraConfig, Look
-from manip_il.sim.view import has_display
-from manip_il.worlds.config import EnvConfig
+from manip_il.sim.config import FILM, CameraConfig
 from manip_il.worlds.table import env_spec, make_env
 
 SIZE = {"height": 240, "width": 320}  # picture size for people [pixels]
@@ -26,48 +19,24 @@ SIZE = {"height": 240, "width": 320}  # picture size for people [pixels]
 
 def run_view(options: ViewOptions) -> None:
     """Run episodes and show them."""
-    in_window, sliders = options.output is None and has_display(), options.policy.type == "sliders"
     env, driver, cameras = open_driver(
         options.policy.path, options.env, options.policy.type or "expert", trust=options.trust
     )
-    if sliders and not in_window:
-        raise UsageError("--policy.type=sliders opens a window: set DISPLAY and omit --output")
-    if sliders:
-        env_spec(env).require("shown in a window", "choose another --policy.type than sliders")
-    in_window = in_window and "shown in a window" in env_spec(env).can
-    # for people to watch; shadows only in files, which may take longer
-    if cameras is None and not in_window:
-        cameras = CameraConfig(
-            default_cameras(env), **SIZE, look=FILM if options.output else Look()
-        )
-    if sliders and not options.env.get("horizon"):
-        env = replace(env, horizon=LONGEST_EPISODE)  # people are slower than the expert
-    conditions = suite_conditions(options.suite, env, sees=in_window or cameras is not None)
+    if options.output is None:
+        env_spec(env).require("shown in a window", "give --output=FILE.rrd")
+    elif cameras is None:
+        cameras = CameraConfig(default_cameras(env), **SIZE, look=FILM)
+    conditions = suite_conditions(options.suite, env, sees=True)
     job = RolloutJob(env, driver, HOLD, conditions=conditions, cameras=cameras)
-    world = make_env(env, observed_cameras(job), conditions)
-    seeds = stream_seeds(
-        "validation", options.n_episodes or (IN_A_FILE if options.output else BLOCK), options.seed
-    )
-    with contextlib.closing(_screen(options, world, env, in_window)) as screen:
-        for step in run_steps(job, [world], seeds, screen.act):
+    world: Any = make_env(env, observed_cameras(job), conditions)
+    count = options.n_episodes or (IN_A_FILE if options.output else BLOCK)
+    seeds = stream_seeds("validation", count, options.seed)
+    screen = RerunLog(env, options.output) if options.output else WindowScreen(world)
+    with contextlib.closing(screen):
+        for step in run_steps(job, [world], seeds):
             if not screen.add(step):
                 break
             if step.done:
                 say(outcome(step))
     if options.output is not None:
-        say(f"next: rerun {options.output}")
-
-
-def _screen(
-    options: ViewOptions, env: Any, config: EnvConfig, in_window: bool
-) -> WindowScreen | RerunLog:
-    if in_window:
-        return WindowScreen(env, sliders=options.policy.type == "sliders")
-    log = RerunLog(config, options.output)
-    if log.address:
-        ports = " ".join(f"-L {port}:localhost:{port}" for port in log.ports)
-        say(
-            f"open: {log.address}",
-            f"from another machine first: ssh {ports} {socket.gethostname()}",
-        )
-    return log
+        say(f"next: rerun {options.output}", f"in a browser: rerun --web-viewer {options.output}")

@@ -57,8 +57,8 @@ from manip_il.tasks.ladder import (
     is_held,
     nearness,
 )
+from manip_il.tasks.objects import IN_AIR, UPRIGHT, draw_lying, draw_xy, turn_left
 from manip_il.tasks.pick_place import OBJECT, PickPlace
-from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying, draw_xy, turn_left
 
 NAME = "carry"
 APART = 0.22  # least sideways distance of the goal from the object at the start, at full scale [m]

@@ -21,7 +21,7 @@ from manip_il.tasks.carry.obstacles import (
     reward_in,
 )
 from manip_il.tasks.carry.task import OBJECT, descent_of
-from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.objects import UPRIGHT
 from manip_il.tasks.table import TASKS
 from manip_il.worlds.ladder.world import make_env
 
