@@ -200,7 +200,8 @@ class Told:
             camera = cameras[turn % len(cameras)]
             points = self.keypoints[camera][frame] if camera in self.keypoints else ()
             if asked := self.questions(frame, points):
-                key, (question, answer) = schema.IMAGES + camera, asked[turn % len(asked)]
+                key = schema.IMAGES + camera
+                question, answer = asked[turn % len(asked)]
                 yield frame, _row("user", "vqa", question, key)
                 yield frame, _row("assistant", "vqa", json.dumps(answer), key)
         for camera, seen in self.keypoints.items():

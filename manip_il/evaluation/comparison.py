@@ -208,8 +208,8 @@ class Study:
         return facts
 
     def table(self) -> Table:
-        """Return one row per side: mean costs, validation, test success, difference, cost to the
-        target on validation.
+        """Return one row per side, and one for each of several tasks: mean costs, validation, test
+        success, difference, cost to the target on validation.
 
         Brackets hold the values of each training seed or, for a single seed, the interval.
         """
@@ -229,6 +229,9 @@ class Study:
             if None not in (first := self._reached(side)):
                 reached = _mean_cost(costs[0], first)
             rows.append((side.name, *cells, points, reached))
+            blank = [""] * (len(cells) - 1)
+            for task, found in side.by_task.items():
+                rows.append((f"{side.name}: {task}", *blank, _rates(found), "", ""))
         head = ("side", *costs, "validation", "test", f"test, against {self.baseline}")
         return Table((*head, f"{costs[0]} to {100 * self.target:g} %"), tuple(rows))
 
@@ -266,6 +269,9 @@ class Study:
             "task": test.task,
             "settings": test.settings.to_json(),
             "test_success": side.rate,
+            "by_task": {
+                task: fmean(one.rate for one in found) for task, found in side.by_task.items()
+            },
             "against_baseline": against.to_json() if against else None,
             "training_seeds": [
                 member.to_json() | {"first_at_target": first.to_json() if first else None}

@@ -297,6 +297,12 @@ class Side:
         return fmean(result.success.rate for result in self.results)
 
     @property
+    def by_task(self) -> dict[str, list[Proportion]]:
+        """The success of each training seed at each of several tasks, {} if there is one."""
+        tasks = self.results[0].by_task
+        return {task: [result.by_task[task].success for result in self.results] for task in tasks}
+
+    @property
     def histories(self) -> tuple[History, ...]:
         """The rounds of each member; empty unless all are runs."""
         runs = tuple(member.history for member in self.members)

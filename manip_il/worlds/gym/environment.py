@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import entry_points, packages_distributions, version
 from pathlib import Path
 from typing import Any, ClassVar, override
@@ -388,8 +388,11 @@ class GymKind(WorldKind):
         if not env.hashes_code:
             return found
         package = type(env.env.unwrapped).__module__.partition(".")[0]
-        sold = [f"{name} {version(name)}" for name in packages_distributions().get(package, [])]
+        sold = [f"{name} {version(name)}" for name in _distributions().get(package, [])]
         return found | {"world_sha256": source_hash(self._cls), "package": ", ".join(sold)}
+
+
+_distributions = cache(packages_distributions)  # a second each time
 
 
 def own_kind(robot: Path | str) -> GymKind | None:
