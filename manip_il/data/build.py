@@ -21,6 +21,7 @@ from manip_il.data.dataset import Dataset, Own
 from manip_il.data.episodes import parts
 from manip_il.data.fingerprint import compare_fingerprints, file_sha256
 from manip_il.data.info import PICTURES, Info, reading
+from manip_il.data.joining import JoinedTasks
 from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.data.lerobot_write import write_dataset, write_episodes
 from manip_il.data.schema import IMAGES, LABEL_VALID, check_same_spec
@@ -194,6 +195,7 @@ def merge_datasets(
 
     Equal to `write_dataset` of all their episodes if ours.
 
+    Datasets of ours with different tasks of one robot become one of several tasks.
     Every column, every frame's text and whole video files are copied. Datasets of ours are
     described as such: the fingerprint is the first one's, and if another differs, a warning is
     logged; the names and provenance of the sources are added to `provenance`.
@@ -214,6 +216,10 @@ def merge_datasets(
     """
     opened = [Dataset.open(source) for source in roots]
     kept = choose_episodes(episodes, sum(one.info.episodes for one in opened))
+    if joined := JoinedTasks.of(opened, provenance or {}):
+        chosen = (one for number, one in enumerate(joined.episodes()) if number in kept)
+        about = opened[0].fps, opened[0].info.robot, joined.own
+        return write_episodes(chosen, root, joined.features, *about, replace=replace)
     names = _new_names(opened, renamed or {})
     own = _merged_description(opened, names, provenance or {})
     features: layout.Features = {}

@@ -289,11 +289,11 @@ class SeveralTasks(WorldKind):
     """
 
     def __init__(self, kind: WorldKind, names: tuple[str, ...]):
-        self._kind, self._names = kind, names
-        self._tasks = cache(lambda config: Tasks(config, self._parts(config)))
+        self._kind, self.names = kind, names
+        self.tasks = cache(lambda config: Tasks(config, self._parts(config)))
 
     def _parts(self, config: EnvConfig) -> tuple[EnvConfig, ...]:
-        return tuple(complete(replace(config, task=name)) for name in self._names)
+        return tuple(complete(replace(config, task=name)) for name in self.names)
 
     @override
     def complete(self, config: EnvConfig) -> EnvConfig:
@@ -317,11 +317,11 @@ class SeveralTasks(WorldKind):
             cameras: Cameras rendered in every step; None for none.
             conditions: How episodes differ from the nominal world, in turn by seed.
         """
-        return SeveralEnv(self._tasks(config), cameras, conditions)
+        return SeveralEnv(self.tasks(config), cameras, conditions)
 
     @override
     def expert(self, config: EnvConfig) -> SeveralExpert:
-        return SeveralExpert(self._tasks(config))
+        return SeveralExpert(self.tasks(config))
 
     @override
     def fingerprint(self, config: EnvConfig) -> dict[str, str]:
@@ -340,7 +340,7 @@ class SeveralTasks(WorldKind):
 
     @override
     def own_files(self, spec: Any, shape: str) -> list[str]:
-        found = [self._kind.own_files(replace(spec, task=name), shape) for name in self._names]
+        found = [self._kind.own_files(replace(spec, task=name), shape) for name in self.names]
         return list(dict.fromkeys(option for options in found for option in options))
 
     @override
