@@ -71,7 +71,8 @@ class RerunLog:
     def __init__(self, env: EnvConfig, output: Path):
         # check first: rerun prints lines of its own if it cannot write
         output.open("wb").close()
-        self._spec, self._frames, self._hz = env_spec(env), 0, env.control_hz
+        self._spec, self._hz = env_spec(env), env.control_hz
+        self._frames = 0
         self._stream = rerun.RecordingStream("manip_il")
         self._stream.save(output)
         for name in (schema.STATE, schema.ACTION, schema.EXECUTED_ACTION):
