@@ -55,8 +55,8 @@ class MergeOptions(Replacing):
     Or take some episodes, also of a single dataset.
 
     Every column, every frame's text and all films are copied. Robot, rate, columns and codecs must
-    agree, and the task if manip-il recorded it. The provenance of datasets of manip-il names the
-    sources.
+    agree. Datasets of manip-il with different tasks become one of several tasks; the provenance
+    names the sources.
 
     Example: manip-il data merge datasets/demos datasets/more --output=datasets/both
     """

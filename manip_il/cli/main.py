@@ -65,7 +65,7 @@ COMMANDS = {
     "data relabel": ("data:RelabelOptions", "relabel a dataset with the current expert"),
     "data annotate": ("data:AnnotateOptions", "add texts that are true of every frame"),
     "data build": ("data:BuildOptions", "rebuild a dataset from its journals"),
-    "data merge": ("data:MergeOptions", "merge datasets of one robot and task"),
+    "data merge": ("data:MergeOptions", "merge datasets of one robot"),
     "data score": (
         "data:ScoreOptions:chapter",
         "score a dataset's episodes by a reward, to find bad ones",
