@@ -102,7 +102,7 @@ class Told:
         spec: The dataset's, with cameras, keypoints and the rate.
         task: What the episode asks.
         subtasks: What the expert does in every frame, (T,); "" where it has no words.
-        positions: True positions of the hand, (T, 3) [m].
+        positions: True positions of the hand, (T, 3) [m]; () if the world does not tell them.
         facts: What is true of a frame, by frame: thing, attribute, value.
         nouns: Words for the keypoints.
         object: Words for what the hand reaches first.
@@ -143,7 +143,8 @@ class Told:
             env.set_state(state)
             phase = labels[frame] if known[frame] else expert.label(state, env).phase
             subtasks.append(env.subtask(int(phase)))
-            positions.append(env.positions()["hand"].copy())
+            if (hand := env.positions().get("hand")) is not None:
+                positions.append(hand.copy())
             if frame % round(spec.fps) == 0:
                 facts[frame] = env.facts()
         points = {
@@ -179,7 +180,8 @@ class Told:
         for number, (start, end) in enumerate(zip(self.starts, ends, strict=True)):
             yield self._lasting(start, "subtask", self.subtasks[start])
             yield self._lasting(start, "plan", self.plan(start))
-            yield self._lasting(start, "motion", _motion(self.positions[[start, end]]))
+            if len(self.positions):
+                yield self._lasting(start, "motion", _motion(self.positions[[start, end]]))
             if number:
                 yield self._lasting(start, "memory", self.memory(start))
         for at in self.takeovers:

@@ -256,10 +256,11 @@ class Environment(Protocol):
     def facts(self) -> list[tuple[str, str, Any]]:
         """Return what is true of the present state: words for a thing, an attribute, its value."""
         found = self.positions()
-        hand = found.pop("hand")
+        hand = found.pop("hand", None)
         return [
             (self.noun(name), "distance to the hand [cm]", round(100 * math.dist(at, hand)))
             for name, at in found.items()
+            if hand is not None
         ]
 
     def varied(self, state: State, drawn: Mapping[str, Any]) -> State:
