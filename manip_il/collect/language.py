@@ -176,13 +176,12 @@ class Told:
         """Yield what stays true until another text of the same style."""
         for text in paraphrases(self.task)[:_PARAPHRASES]:
             yield self._lasting(0, "task_aug", text, "user")
-        ends = [*self.starts[1:], len(self.subtasks) - 1]
-        for number, (start, end) in enumerate(zip(self.starts, ends, strict=True)):
+        for start, end in pairwise((*self.starts, len(self.subtasks) - 1)):
             yield self._lasting(start, "subtask", self.subtasks[start])
             yield self._lasting(start, "plan", self.plan(start))
             if len(self.positions):
                 yield self._lasting(start, "motion", _motion(self.positions[[start, end]]))
-            if number:
+            if start:
                 yield self._lasting(start, "memory", self.memory(start))
         for at in self.takeovers:
             if at not in self.starts:

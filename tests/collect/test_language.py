@@ -171,8 +171,17 @@ def test_held_out_texts_are_other_texts_and_all_are_the_same_everywhere():
     assert trained[1:3] == paraphrases(text)[1:3]
 
 
-def test_a_dataset_without_cameras_has_no_questions(tmp_path):
-    record(tmp_path / "plain", make_config("panda", "reach"), 1)
+@pytest.mark.parametrize(
+    ("robot", "task", "styles"),
+    [
+        ("panda", "reach", {"subtask", "plan", "memory", "motion", "task_aug"}),
+        ("metaworld", "reach-v3", {"task_aug"}),
+    ],
+)
+def test_a_world_without_cameras_or_phases_goes_without(tmp_path, robot, task, styles):
+    record(tmp_path / "plain", make_config(robot, task), 1)
     source = open_source(tmp_path / "plain")
     annotate_dataset(source, EditTarget(tmp_path / "told"))
-    assert not any(frame["language_events"] for frame in frames(tmp_path / "told"))
+    told = frames(tmp_path / "told")
+    assert {one["style"] for one in told[0]["language_persistent"]} == styles
+    assert not any(frame["language_events"] for frame in told)
