@@ -24,6 +24,7 @@ from manip_il.evaluation.report import (
 )
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.side import Side, costs_of
+from manip_il.worlds.contract import UNNAMED
 from manip_il.worlds.table import world_of
 
 _MARKERS = ("o-", "s-", "D-", "^-")  # distinguishable without colour
@@ -51,7 +52,7 @@ def eval_report(result: EvalResult, films: Sequence[Film] = ()) -> Report:
         f" {result.task}"
     )
     phase, count = next(iter(result.failures.items()), ("", 0))
-    if phase:  # else nothing failed, or the task has no phases
+    if phase not in ("", *UNNAMED):  # else nothing failed, or the expert names no phases
         verdict += (
             f"; {count:,} of its {success.n - success.successes:,} failures end in the phase"
             f" {phase}"
