@@ -95,19 +95,18 @@ class RenderError(ManipError):
     """OpenGL for off-screen rendering does not work."""
 
 
-def nearest(name: str, known: Iterable[str], most: int = 1) -> str:
-    """Return a hint at the known names that are most like a name.
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a hint at the known name that is most like a name.
 
     Args:
         name: The unknown name.
         known: The known names.
-        most: The greatest number of names in the hint.
 
     Returns:
-        ` (did you mean 'x' or 'y'?)`, or "" if no known name is near.
+        ` (did you mean 'x'?)`, or "" if no known name is near.
     """
-    near = difflib.get_close_matches(name, list(known), most)
-    return f" (did you mean {' or '.join(map(repr, near))}?)" if near else ""
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
 
 
 def printable(text: str) -> str:

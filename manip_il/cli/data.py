@@ -5,19 +5,14 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 
-from manip_il.checks import parse_yaml, shorten
 from manip_il.cli.common_options import SMALL, OfDataset, Pictured, Published, Varied
 from manip_il.cli.outputs import Output, Replacing, output_folder
 from manip_il.cli.parsing import Given, given
-from manip_il.errors import UsageError
 from manip_il.option import NameOrPath, Seeded, option
 from manip_il.sim.config import CameraConfig, Look
-
-_EXAMPLE = '{"observation.images.top": "observation.images.front"}'
 
 
 @dataclass(frozen=True)
@@ -31,21 +26,6 @@ class BuildOptions(Replacing):
 
     journals: Path = option(MISSING, "folder of episode-*.mcap files", positional=True)
     dataset: Path = option(MISSING, "folder of the new dataset", positional=True)
-
-
-class RenameMap(dict[str, str]):
-    """Name of a camera's column -> its new name."""
-
-    @classmethod
-    def parse(cls, text: str) -> RenameMap:
-        """Read JSON, as for LeRobot's `--rename_map`.
-
-        Raises `UsageError` if it is something else.
-        """
-        with suppress(ValueError):
-            if isinstance(found := parse_yaml(text), dict):
-                return cls({str(old): str(new) for old, new in found.items()})
-        raise UsageError(f"--rename_map is {shorten(text)}; expected {_EXAMPLE}")
 
 
 @dataclass(frozen=True)
@@ -68,11 +48,6 @@ class MergeOptions(Replacing):
         "episodes to take, numbered through all datasets: 0:50 for the first 50, or [0,3,5]; by"
         " default all",
         flag="dataset.episodes",
-    )
-    renamed: RenameMap = option(
-        RenameMap,
-        f"new names of cameras: {_EXAMPLE}",
-        flag="rename_map",
     )
 
 

@@ -274,7 +274,6 @@ def without_none(option_type: Any) -> Any:
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 _EXPECTED = "a YAML file of options"
-_MOST_OFFERED = 3  # names that an error suggests
 type Known = Mapping[str, Option]
 
 
@@ -453,7 +452,7 @@ def _decode(one: _Value) -> Any:
 
 
 def _unknown_option(kind: str, name: str, known: Known) -> UsageError:
-    """Return the error for an unknown option or key, with the nearest names.
+    """Return the error for an unknown option or key, with the nearest name.
 
     `num_episodes` finds `dataset.num_episodes`. kind: `option`, or `key in FILE:`.
     """
@@ -464,5 +463,4 @@ def _unknown_option(kind: str, name: str, known: Known) -> UsageError:
     ]
     if not name.startswith("--"):
         labels = [label.replace("--", "") for label in labels]
-    near = nearest(name, labels, _MOST_OFFERED)
-    return UsageError(f"unknown {kind} {shorten(name)}{near}; --help lists all")
+    return UsageError(f"unknown {kind} {shorten(name)}{nearest(name, labels)}; --help lists all")

@@ -9,7 +9,7 @@ import logging
 import os
 import pickle
 import tempfile
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,18 +27,12 @@ from manip_il.sim.mesh import mesh_path
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
 try:
     import ray
-    from ray import exceptions
 except ImportError as missing:
     raise ManipError("--engine=ray needs Ray: pip install 'manip_il[ray]'") from missing
 
 Files = dict[str, bytes]
+_RETRIES = 3  # of a task whose worker or node died
 _LEVEL = 1  # compression level; reduces an episode without pictures to a fifth
-_DEATHS = (
-    exceptions.WorkerCrashedError,
-    exceptions.NodeDiedError,
-    exceptions.ObjectLostError,
-    exceptions.OutOfMemoryError,
-)
 
 
 class RayPool:
@@ -113,8 +107,6 @@ class RayPool:
                 if journal is not None:
                     journal.store(episode.seed, content)
             future.set_result([episode for episode, _ in found])
-        except _DEATHS as death:
-            future.set_exception(BrokenExecutor(str(death)))
         except ManipError as error:
             future.set_exception(getattr(error, "cause", error))  # the error raised on the node
         except Exception as error:
@@ -190,10 +182,10 @@ def run_there(
         return zstandard.compress(pickle.dumps(found), _LEVEL)
 
 
-# The engine counts deaths, so Ray must not retry. The remote function has another name than
+# Ray runs a task again if its worker or node dies. The remote function has another name than
 # `run_there`, so that Ray pickles `run_there` by name. So each node runs the `run_there` of its own
 # version, which compares the versions.
-_run_remote = ray.remote(num_cpus=1, max_retries=0)(run_there)
+_run_remote = ray.remote(num_cpus=1, max_retries=_RETRIES)(run_there)
 
 
 def _unpack(files: Files, folder: Path) -> Path:

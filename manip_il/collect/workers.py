@@ -1,7 +1,7 @@
 """Run rollout jobs in this process, in local processes, or on a Ray cluster.
 
-Each seed of a job always gives the same episode. So if a worker dies, its unfinished seeds simply
-run again, each alone, which identifies the seed that kills workers.
+Each seed of a job always gives the same episode. If a local worker dies, the run ends with one
+error, and can be resumed; Ray runs the seeds of a worker or node that died again by itself.
 
 Processes are forked from a server that has only imported what they need. So they inherit neither
 OpenGL nor threads, and the slow import of torch runs once. They end with the process that started
@@ -17,7 +17,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import islice
 from multiprocessing import forkserver, resource_tracker
 from typing import TYPE_CHECKING, Literal, Union
@@ -68,7 +68,7 @@ class Engine:
             journal: Where finished episodes are written; None to write none.
 
         Raises:
-            ManipError: if a seed that ran alone kills its worker; also what the job raises.
+            ManipError: if a worker dies; also what the job raises.
         """
         if self._backend == "local" and (
             self.workers == 1 or (len(seeds) == 1 and self._pool is None)
@@ -77,8 +77,9 @@ class Engine:
             return
         self._pool = self._pool or self._open()
         try:
-            for episodes in self._results(self._pool, job, seeds, journal):
-                yield from episodes
+            with _deaths_told():
+                for episodes in self._results(self._pool, job, seeds, journal):
+                    yield from episodes
         except BaseException:
             self._close()  # running episodes are no longer needed
             raise
@@ -113,31 +114,16 @@ class Engine:
     def _results(
         self, pool: Pool, job: RolloutJob, seeds: Sequence[int], journal: Journal | None
     ) -> Iterator[list[Episode]]:
-        """Yield the tasks' results; seeds of a worker that died run again, one by one."""
+        """Yield the tasks' results."""
         tasks = split(job, seeds, pool.count)
-        running = dict[Future[list[Episode]], Seeds]()
+        running = set[Future[list[Episode]]]()
         while tasks or running:
             while tasks and len(running) < pool.count:
-                task = tasks.popleft()
-                running[pool.submit(job, task, journal)] = task
+                running.add(pool.submit(job, tasks.popleft(), journal))
             done, _ = wait(running, return_when=FIRST_COMPLETED)
-            if any(isinstance(future.exception(), BrokenExecutor) for future in done):
-                done, _ = wait(running)  # all others end first, so that each lost seed runs alone
-            lost: list[int] = []
             for future in done:
-                task = running.pop(future)
-                if isinstance(future.exception(), BrokenExecutor):
-                    lost += task
-                else:
-                    yield future.result()
-            for seed in lost:
-                try:
-                    yield pool.submit(job, (seed,), journal).result()
-                except BrokenExecutor:
-                    raise ManipError(
-                        f"seed {seed} killed its worker twice (out of memory?); finished episodes"
-                        " are kept"
-                    ) from None
+                running.remove(future)
+                yield future.result()
 
 
 def engine_of(workers: int | Engine | None) -> AbstractContextManager[Engine]:
@@ -146,7 +132,7 @@ def engine_of(workers: int | Engine | None) -> AbstractContextManager[Engine]:
 
 
 class LocalPool:
-    """Local processes, which are replaced when one dies."""
+    """Local processes, which start when the first task is submitted."""
 
     def __init__(self, count: int):
         self.count = count
@@ -166,11 +152,7 @@ class LocalPool:
             The future of the episodes, which come without pictures.
         """
         self._pool = self._pool or open_pool(self.count, learned=job.policy is not None)
-        try:
-            return self._pool.submit(_in_worker, run_task, job, seeds, journal)
-        except BrokenExecutor:
-            self.close()
-            return self.submit(job, seeds, journal)
+        return self._pool.submit(_in_worker, run_task, job, seeds, journal)
 
     def close(self) -> None:
         """Kill all processes."""
@@ -198,19 +180,28 @@ def map_in_order[T, R](
         return
     pool, items = open_pool(workers), iter(items)
     try:
-        waiting = deque(
-            (item, pool.submit(_in_worker, function, item)) for item in islice(items, workers + 1)
-        )
-        while waiting:
-            item, result = waiting.popleft()
-            yield item, result.result()
-            waiting.extend(
-                (item, pool.submit(_in_worker, function, item)) for item in islice(items, 1)
+        with _deaths_told():
+            waiting = deque(
+                (item, pool.submit(_in_worker, function, item))
+                for item in islice(items, workers + 1)
             )
-    except BrokenExecutor as error:
-        raise ManipError("a worker died (out of memory?); try fewer --workers") from error
+            while waiting:
+                item, result = waiting.popleft()
+                yield item, result.result()
+                waiting.extend(
+                    (item, pool.submit(_in_worker, function, item)) for item in islice(items, 1)
+                )
     finally:
         kill_pool(pool)
+
+
+@contextmanager
+def _deaths_told() -> Iterator[None]:
+    """Raise `ManipError` where a worker has died."""
+    try:
+        yield
+    except BrokenExecutor as error:
+        raise ManipError("a worker died (out of memory?); try fewer --workers") from error
 
 
 def open_pool(workers: int, *, learned: bool = False) -> ProcessPoolExecutor:

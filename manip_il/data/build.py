@@ -24,10 +24,10 @@ from manip_il.data.info import PICTURES, Info, reading
 from manip_il.data.joining import JoinedTasks
 from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.data.lerobot_write import write_dataset, write_episodes
-from manip_il.data.schema import IMAGES, LABEL_VALID, check_same_spec
+from manip_il.data.schema import LABEL_VALID, check_same_spec
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import ManipError, MismatchError, NothingToLearnError, UnknownName, UsageError
-from manip_il.mdp import KEYPOINTS, Episode
+from manip_il.errors import ManipError, MismatchError, NothingToLearnError, UsageError
+from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
 RECORDING = "recording.json"
@@ -186,7 +186,6 @@ def merge_datasets(
     roots: Sequence[Path],
     root: Path,
     episodes: Sequence[str] = (),
-    renamed: Mapping[str, str] | None = None,
     *,
     provenance: Mapping[str, Any] | None = None,
     replace: bool = False,
@@ -207,12 +206,10 @@ def merge_datasets(
         replace: Whether to replace a dataset of ours at `root`.
         episodes: Episodes to keep, as in `choose_episodes`, numbered as in the merged datasets; by
             default all.
-        renamed: Camera -> its new name, both with `observation.images.`.
 
     Raises:
         MismatchError: Robot, rate, columns or codecs differ; names both sides.
-        UsageError: An episode does not exist, or a name is invalid.
-        UnknownName: There is no such camera.
+        UsageError: An episode does not exist.
     """
     opened = [Dataset.open(source) for source in roots]
     kept = choose_episodes(episodes, sum(one.info.episodes for one in opened))
@@ -220,20 +217,16 @@ def merge_datasets(
         chosen = (one for number, one in enumerate(joined.episodes()) if number in kept)
         about = opened[0].fps, opened[0].info.robot, joined.own
         return write_episodes(chosen, root, joined.features, *about, replace=replace)
-    names = _new_names(opened, renamed or {})
-    own = _merged_description(opened, names, provenance or {})
+    own = _merged_description(opened, provenance or {})
     features: layout.Features = {}
     for one in opened:
-        _check_same_facts(opened[0], one, names)
-        table = {names.get(key, key): feature for key, feature in one.stored_features.items()}
-        if len(table) < len(one.stored_features):
-            raise UsageError(f"--rename_map gives two columns of {one.root} the same name")
-        for key, feature in table.items():
+        _check_same_facts(opened[0], one)
+        for key, feature in one.stored_features.items():
             # encoded if others have films
             if features.setdefault(key, feature)["dtype"] == "image":
                 features[key] = feature
 
-    stored = itertools.chain.from_iterable(one.stored_episodes(renamed=names) for one in opened)
+    stored = itertools.chain.from_iterable(one.stored_episodes() for one in opened)
     chosen = (one for number, one in enumerate(stored) if number in kept)
     about = opened[0].fps, opened[0].info.robot, own
     return write_episodes(
@@ -267,9 +260,7 @@ def choose_episodes(words: Sequence[str], count: int) -> set[int]:
     return chosen
 
 
-def _merged_description(
-    opened: Sequence[Dataset], names: Mapping[str, str], provenance: Mapping[str, Any]
-) -> Own | None:
+def _merged_description(opened: Sequence[Dataset], provenance: Mapping[str, Any]) -> Own | None:
     """Return the content of `meta/manip_il.json` for merged datasets.
 
     None if no dataset is ours.
@@ -285,29 +276,13 @@ def _merged_description(
         ):
             _LOG.warning("%s", warning)
     sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
-    cameras = tuple(names.get(key, key).removeprefix(IMAGES) for key in about.spec.image_keys)
-    spec = dataclasses.replace(
-        about.spec, cameras=cameras, video=any(one.spec.video for one in opened)
-    )
+    spec = dataclasses.replace(about.spec, video=any(one.spec.video for one in opened))
     return Own(spec, own, {**provenance, "merged": sources})
 
 
-def _new_names(opened: Sequence[Dataset], renamed: Mapping[str, str]) -> dict[str, str]:
-    """Return the new names of the columns of the cameras in `renamed`: pictures and keypoints."""
-    known, names = {key for one in opened for key in one.cameras}, dict[str, str]()
-    for old, new in renamed.items():
-        if old not in known:
-            raise UnknownName("camera in --rename_map", old, known)
-        if any(one.info.of_dtype("language") for one in opened):
-            raise UsageError("--rename_map cannot rename the cameras that columns of language name")
-        camera = checks.name("a camera in --rename_map", new.removeprefix(IMAGES))
-        names |= {old: IMAGES + camera, KEYPOINTS + old.removeprefix(IMAGES): KEYPOINTS + camera}
-    return names
-
-
-def _check_same_facts(left: Dataset, right: Dataset, names: Mapping[str, str]) -> None:
-    """Raise `MismatchError` unless two datasets can be merged. names: new names of columns."""
-    ours, theirs = _facts(left, names), _facts(right, names)
+def _check_same_facts(left: Dataset, right: Dataset) -> None:
+    """Raise `MismatchError` unless two datasets can be merged."""
+    ours, theirs = _facts(left), _facts(right)
     for what in {**ours, **theirs}:
         one, other = ours.get(what, "none"), theirs.get(what, "none")
         # no film, or not described as fully
@@ -316,16 +291,16 @@ def _check_same_facts(left: Dataset, right: Dataset, names: Mapping[str, str]) -
             raise MismatchError(what, str(left.root), one, str(right.root), other)
 
 
-def _facts(dataset: Dataset, names: Mapping[str, str]) -> dict[str, str]:
+def _facts(dataset: Dataset) -> dict[str, str]:
     """Return what merged datasets must have in common: rate, robot, columns, films, other
     tables.
     """
     facts = {"fps": str(dataset.fps), "robot_type": dataset.info.robot or "none"}
     for key, one in dataset.features.items():
-        name, kind = names.get(key, key), "pictures" if one.dtype in PICTURES else one.dtype
-        facts[f"column {name}"] = f"{kind} of shape {[*one.shape]}, named {one.names}"
+        kind = "pictures" if one.dtype in PICTURES else one.dtype
+        facts[f"column {key}"] = f"{kind} of shape {[*one.shape]}, named {one.names}"
         facts |= {
-            f"film {name}: {what}": one.details[what] for what in _CODEC if what in one.details
+            f"film {key}: {what}": one.details[what] for what in _CODEC if what in one.details
         }
     for key in {key for row in dataset.episodes.others for key in row} - {layout.DRAWN}:
         facts[f"column {key} of meta/episodes"] = "a column"

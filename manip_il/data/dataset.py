@@ -332,15 +332,12 @@ class Dataset:
             )
         return [self.tasks[number] for number in numbers.tolist()]
 
-    def stored_episodes(
-        self, names: Sequence[str] | None = None, renamed: Mapping[str, str] | None = None
-    ) -> Iterator[EpisodeData]:
+    def stored_episodes(self, names: Sequence[str] | None = None) -> Iterator[EpisodeData]:
         """Yield the episodes as they are stored, in order; one data file is in memory at a time.
 
         Args:
             names: Columns to read, by default all in data files, except the numbers of rows,
                 episodes and tasks.
-            renamed: Column or camera -> its new name.
         """
         if names is None:
             names = [
@@ -348,7 +345,6 @@ class Dataset:
                 for key, one in self.features.items()
                 if one.dtype != "video" and key not in _NUMBERED
             ]
-        new = {key: (renamed or {}).get(key, key) for key in self.features}
         table = self.episodes
         films = {key: self._film_ranges(key) for key in table.clips}
         statistics = read_picture_statistics(self.root, self.cameras)
@@ -361,11 +357,11 @@ class Dataset:
             ):
                 rows = slice(table.start[place] - cells.row, table.stop[place] - cells.row)
                 yield EpisodeData(
-                    columns={new[name]: column[rows] for name, column in columns.items()},
+                    columns={name: column[rows] for name, column in columns.items()},
                     tasks=texts[rows],
                     others=undrawn | table.others[place],
-                    films={new[key]: ranges[place] for key, ranges in films.items()},
-                    picture_statistics={new[key]: one for key, one in statistics[place].items()},
+                    films={key: ranges[place] for key, ranges in films.items()},
+                    picture_statistics=statistics[place],
                 )
 
     def count_successes(self) -> int:

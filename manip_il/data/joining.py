@@ -47,9 +47,11 @@ class JoinedTasks:
         Raises:
             MismatchError: if more than the task differs.
         """
+        if not all(one.own for one in datasets):
+            return None
         specs = [one.spec for one in datasets]
         names = tuple(dict.fromkeys(spec.task for spec in specs))
-        if len(names) < 2 or not all(one.own for one in datasets):
+        if len(names) < 2:
             return None
         first = specs[0]
         for one, spec in zip(datasets, specs, strict=True):

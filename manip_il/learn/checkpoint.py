@@ -433,22 +433,11 @@ def find_policy(path: Path) -> Path:
     raise UsageError(f"no policy in {path}; expected {wanted}")
 
 
-def hub_hint(path: Path, kind: str = "") -> str:
-    """Return how to pull a path that looks like a Hub repository.
-
-    Args:
-        path: The path that was not found.
-        kind: `datasets/` for a dataset.
-
-    Returns:
-        The end of a message, or "" if the path does not look like a Hub repository.
-    """
+def hub_hint(path: Path) -> str:
+    """Return how to pull a path that looks like a Hub repository; "" for any other path."""
     if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
         return ""
-    return (
-        f"; if it is on the Hub, get it by manip-il pull hf://{kind}{path} FOLDER and give that"
-        " FOLDER"
-    )
+    return f"; if it is on the Hub, get it by manip-il pull hf://{path} FOLDER and give that FOLDER"
 
 
 def policy_folder(policy: Any) -> Path:

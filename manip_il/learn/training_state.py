@@ -31,8 +31,6 @@ if TYPE_CHECKING:  # LeRobot takes seconds to import
     from lerobot.configs.train import TrainPipelineConfig
 
 PRETRAINED_MODEL = "pretrained_model"
-TRAINING_STATE = "training_state"
-STEP_FILE = "training_step.json"
 METRICS_FILE, TENSORBOARD_FOLDER = "metrics.jsonl", "tensorboard"
 Writer = Callable[[Record], None]
 

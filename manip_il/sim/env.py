@@ -25,7 +25,6 @@ from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.shape import ANY
 from manip_il.sim.task import Task
 from manip_il.sim.variation import with_drawn
-from manip_il.sim.view import Window, require_display
 from manip_il.sim.world import Scene, World
 
 _JOINT_JITTER = 0.03  # largest offset of every arm joint at the start [rad]
@@ -54,7 +53,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
-        "render_modes": ["human", "rgb_array"],
+        "render_modes": ["rgb_array"],
         "render_fps": 20,
     }
 
@@ -77,14 +76,12 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             config: Length and control rate of the episodes, and when they count as solved.
             cameras: Cameras of observations; None: no pictures.
             look: Lighting of `render`'s pictures; by default that of `cameras`.
-            render_mode: `rgb_array`, or `human`, with which `reset` and `step` update MuJoCo's
-                viewer in real time.
+            render_mode: `rgb_array`; None: `render` returns None.
             conditions: How episodes differ from the nominal world; they take turns by seed.
 
         Raises:
             UnknownName: If there is no such camera or render mode.
             UsageError: If the scene cannot be built.
-            RenderError: If `human` is asked for and there is no display.
         """
         self.look, self._view = look or (cameras.look if cameras else Look()), cameras
         self.config = config
@@ -96,9 +93,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         require_cameras(cameras, CAMERAS)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UnknownName("render_mode", render_mode, self.metadata["render_modes"])
-        if render_mode == "human":
-            require_display()
-        self.render_mode, self._window = render_mode, None
+        self.render_mode = render_mode
         self.cameras = cameras.names if cameras else ()
         self.metadata = self.metadata | {"render_fps": self.config.control_hz}
         self._max_episode_steps = self.config.horizon
@@ -136,8 +131,6 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """
         super().reset(seed=seed)
         self.start(int(self.np_random.integers(2**62)) if seed is None else seed)
-        if self.render_mode == "human":
-            self.render()
         return self._observation(), self._info()
 
     @property
@@ -205,8 +198,6 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             MismatchError: If it has the wrong shape.
         """
         self.advance(action)
-        if self.render_mode == "human":
-            self.render()
         reward, info = self.reward, self._info()
         return self._observation(), reward, False, self._step >= self.config.horizon, info
 
@@ -350,18 +341,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
         None unless render_mode is `rgb_array`.
         """
-        if self.render_mode == "rgb_array":
-            return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
-        if self.render_mode == "human":
-            self._window = self._window or Window(self.scene, self.config.control_hz)
-            self._window.show(self.data, self.world.variation)
-        return None
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._window is not None:
-            self._window.close()
-            self._window = None
+        if self.render_mode is None:
+            return None
+        return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
 
     def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
         return pictures(self.scene, self.data, cameras, self.world.variation)

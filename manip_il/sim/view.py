@@ -247,9 +247,7 @@ def require_display() -> None:
         opened = has_display() and glfw.init()
     if not opened:
         named = ", ".join(f"{name}={os.environ.get(name, '')}" for name in DISPLAYS)
-        raise RenderError(
-            f'no display: {named}; use render_mode="rgb_array", or manip-il view --output=FILE.rrd'
-        )
+        raise RenderError(f"no display: {named}; write a file: manip-il view --output=FILE.rrd")
 
 
 class Clock:

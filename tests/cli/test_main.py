@@ -55,7 +55,7 @@ def test_the_module_runs_as_a_program():
             2,
             (
                 "manip-il: error: unknown option '--dataset.num_episods' "
-                "(did you mean '--dataset.num_episodes' or '--dataset.root'?); "
+                "(did you mean '--dataset.num_episodes'?); "
                 "--help lists all"
             ),
         ),

@@ -96,7 +96,7 @@ def test_words_change_what_they_name(words, change):
         ),
         (
             ["--repo_id=x"],
-            ["unknown option '--repo_id' (did you mean '--small.repo_id' or '--dataset.repo_id'?)"],
+            ["unknown option '--repo_id' (did you mean '--small.repo_id'?)"],
         ),
         (["--dataset=x"], ["unknown option '--dataset' (did you mean '--dataset.root'"]),
         (["--lr=fast"], ["--lr", "expected FLOAT", "'fast'"]),

@@ -330,29 +330,6 @@ def test_chosen_episodes_are_taken_with_their_films(annotated, tmp_path):
     )
 
 
-def test_a_camera_is_renamed_where_it_has_another_name(root, recorded, tmp_path):
-    names = json.dumps({TOP: FRONT})
-    assert (
-        main(
-            ["data", "merge", str(root), f"--rename_map={names}", f"--output={tmp_path / 'front'}"]
-        )
-        == 0
-    )
-    both = [str(recorded), str(tmp_path / "front")]
-    assert main(["data", "merge", *both, f"--output={tmp_path / 'no'}"]) == 1
-    assert (
-        main(["data", "merge", *both, f"--rename_map={names}", f"--output={tmp_path / 'both'}"])
-        == 0
-    )
-    merged, before = Dataset.open(tmp_path / "both"), Dataset.open(recorded)
-    assert merged.cameras == [FRONT]
-    pictures = before.frames(TOP, np.arange(len(before)))
-    np.testing.assert_array_equal(
-        merged.frames(FRONT, np.arange(len(merged))), np.concatenate([pictures] * 2)
-    )
-    assert examine_folder(tmp_path / "both") == []
-
-
 @pytest.mark.parametrize(
     ("change", "what"),
     [

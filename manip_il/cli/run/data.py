@@ -64,8 +64,9 @@ def run_merge(options: MergeOptions) -> None:
     """Merge; the new dataset appears when it is complete."""
     with exclusive(options.output):
         require_writable(options.output, DATASET, options.overwrite, options.datasets)
-        part = options.episodes, options.renamed
-        info = merge_datasets(options.datasets, options.output, *part, replace=options.overwrite)
+        info = merge_datasets(
+            options.datasets, options.output, options.episodes, replace=options.overwrite
+        )
     say(f"merged {info.episodes:,} episodes, {info.frames:,} frames", f"dataset: {options.output}")
 
 

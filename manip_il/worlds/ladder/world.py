@@ -114,7 +114,6 @@ def make_env(
     Raises:
         UnknownName: for a robot, a task, a camera or a `render_mode`.
         UsageError: for any other wrong value.
-        RenderError: for the `render_mode` `human` without a display.
     """
     config = make_config(robot, task, **settings)
     seen = CameraConfig(tuple(cameras), *image_size, look or Look()) if cameras else None
