@@ -32,9 +32,9 @@ def test_a_mapping_is_its_file_and_the_example_loads(tmp_path: Path) -> None:
     )
     example = load_mapping(ROOT / "configs/mcap/panda.yaml")
     assert [one.topic for one in example.sources.values()][:3] == [
-        "/observation/state",
+        "/joint_states",
         "/action",
-        "/next/reward",
+        "/scalars",
     ]
 
 
