@@ -161,7 +161,7 @@ def _dispatch(own: list[str], others: list[str]) -> None:
     elif own[0] in GROUPS and (not own[1:] or own[1] in HELP):
         print(_help(own[0]))
     elif {*HELP} & {*words}:
-        print(_command_help(name, load(name)))
+        print(_command_help(name, load(name), words))
     else:
         options = parse(load(name), [*words, *others])
         silence_ffmpeg_warning()
@@ -211,8 +211,11 @@ def _help(group: str = "") -> str:
     )
 
 
-def _command_help(name: str, cls: Any) -> str:
-    """Return the help of one command."""
+def _command_help(name: str, cls: Any, words: Sequence[str]) -> str:
+    """Return the help of one command.
+
+    words: the command line; with `--policy.type=act` the options of that policy are listed, too.
+    """
     options = options_of(cls)
     positional = [option for option in options if option.positional]
     places = "".join(
@@ -220,10 +223,17 @@ def _command_help(name: str, cls: Any) -> str:
     )
     rows = dict(map(_row, options))
     rows["--config_path=FILE.yaml"] = "read options from YAML; the command line overrides them"
+    kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
+    more = ""
+    if kind and any(one.is_open for one in options):
+        from manip_il.learn.lerobot_config import option_lines
+
+        lines = _table({left: f"[{right}]" for left, right in option_lines(kind)})
+        more = f"\n\noptions of {kind}:\n{lines}"
     text, _, example = str(inspect.getdoc(cls)).partition("Example: ")
     return (
         f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{text.strip()}\n\n"
-        f"options:\n{_table(rows)}\n\n{_GLOBAL_HELP}\n\nexample: {' '.join(example.split())}"
+        f"options:\n{_table(rows)}{more}\n\n{_GLOBAL_HELP}\n\nexample: {' '.join(example.split())}"
     )
 
 

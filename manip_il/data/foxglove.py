@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from manip_il.data import schema as s
 from manip_il.mdp import Episode
+from manip_il.worlds.contract import EnvironmentSpec
 
 U8 = NDArray[np.uint8]
 Encode = Callable[[Any, Timestamp], Message | str]  # a frame's value and time -> message, or JSON
@@ -35,6 +36,12 @@ Channel = tuple[Encode, Iterable[Any]]  # with one value per frame
 
 NANOSECONDS = 1_000_000_000
 IMAGE_TOPICS = "/observation/images/"  # prefix of a camera's topic, as in LeRobot
+_JOINT_TOPICS = {
+    "/joint_states": s.STATE,
+    "/action": s.ACTION,
+    "/executed_action": s.EXECUTED_ACTION,
+}
+_SCALARS = (s.ACTOR, s.EXPERT_PHASE, s.LABEL_VALID, s.REWARD, s.SUCCESS, s.DONE)
 
 # copied from LeRobot (`lerobot.utils.foxglove_visualization`)
 _SCALARS_NAME = "lerobot.Scalars"
@@ -99,16 +106,25 @@ def texts(name: str) -> Encode:
     return lambda line, time: Log(timestamp=time, level=Log.Level.INFO, name=name, message=line)
 
 
-def picture_channels(episode: Episode) -> dict[str, Channel]:
-    """Return an episode's pictures by topic."""
-    cameras = {
-        key.removeprefix(s.IMAGES): pictures
-        for key, pictures in episode.columns.items()
-        if key.startswith(s.IMAGES)
+def episode_channels(episode: Episode, spec: EnvironmentSpec) -> dict[str, Channel]:
+    """Return an episode's columns by topic. spec: names the numbers of states and actions."""
+    columns = episode.columns
+    found: dict[str, Channel] = {
+        topic: (
+            joint_states(spec.observed_names if key == s.STATE else spec.joint_names),
+            columns[key].tolist(),
+        )
+        for topic, key in _JOINT_TOPICS.items()
+        if key in columns
     }
-    return {
-        IMAGE_TOPICS + camera: (images(camera), pictures) for camera, pictures in cameras.items()
-    }
+    if numbers := {key: columns[key].reshape(-1) for key in _SCALARS if key in columns}:
+        rows = zip(*(column.tolist() for column in numbers.values()), strict=True)
+        found["/scalars"] = scalars(list(numbers)), rows
+    for key, pictures in columns.items():
+        if key.startswith(s.IMAGES):
+            camera = key.removeprefix(s.IMAGES)
+            found[IMAGE_TOPICS + camera] = images(camera), pictures
+    return found
 
 
 def add_channels(writer: Writer, channels: Mapping[str, Channel], times: Sequence[int]) -> None:

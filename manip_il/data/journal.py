@@ -1,8 +1,8 @@
 """Journals: one crash-safe MCAP file for every finished episode.
 
 A file is written under a temporary name, synced and renamed, so it is complete or absent. Every
-column is kept bit for bit: numbers as an attachment (`<column>.npy`), pictures as messages, which
-Foxglove shows.
+column is kept bit for bit: numbers as an attachment (`<column>.npy`), pictures as messages.
+Foxglove shows all messages.
 """
 
 import json
@@ -51,7 +51,8 @@ class Journal:
         writer.start(profile="", library=_RECORD)
         writer.add_metadata(_RECORD, _to_texts(self, episode))
         times = foxglove.frame_times(len(episode), exact_rate(self.spec.fps))
-        foxglove.add_channels(writer, foxglove.picture_channels(episode), times)
+        channels = foxglove.episode_channels(episode, self.spec)
+        foxglove.add_channels(writer, channels, times)
         for key, column in episode.columns.items():
             if not key.startswith(IMAGES):  # pictures are stored as lossless messages
                 numbers = BytesIO()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import json
 import typing
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -135,6 +136,23 @@ def decode(cls: type[Any], settings: Mapping[str, Any], source: str) -> Any:
     except Exception as error:
         reason = error if isinstance(error, DecodingError) else error.__cause__ or error
         raise UsageError(f"{source}: {' '.join(str(reason).split())}") from error
+
+
+def option_lines(kind: str) -> list[tuple[str, str]]:
+    """Return name and default of every option of a policy type, for the help."""
+    rows = []
+    for field in dataclasses.fields(policy_class(kind)):
+        if not field.init or field.name in (*NOT_OURS, "input_features", "output_features"):
+            continue
+        missing = field.default is dataclasses.MISSING
+        default = (
+            field.default_factory()
+            if missing and callable(field.default_factory)
+            else field.default
+        )
+        typed = json.dumps(draccus.encode(default)).replace('"', "")  # as a user would type it
+        rows.append((f"--policy.{field.name}", typed))
+    return rows
 
 
 def policy_features(

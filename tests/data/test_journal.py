@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from manip_il.data import schema as s
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
+from ..mcap.use import decoded
 from ..pictures import numbered_episodes, with_cameras
 from ..synthetic import MakeEpisode
 
@@ -70,6 +72,24 @@ def test_a_file_cut_short_is_refused_by_name(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(ManipError, match=r"episode-000000000017\.mcap is not a complete episode"):
         journal.read_journal(path)
+
+
+def test_foxglove_sees_joints_and_scalars(tmp_path, make_episode, spec):
+    episode = make_episode(8, 3)
+    topics: dict[str, list[tuple[int, Any]]] = {}
+    path = journal.Journal(tmp_path, spec, {}).write(episode)
+    for topic, time, message in decoded(path.read_bytes()):
+        topics.setdefault(topic, []).append((time, message))
+    assert sorted(topics) == ["/action", "/executed_action", "/joint_states", "/scalars"]
+    assert [time for time, _ in topics["/scalars"]] == [0, 50_000_000, 100_000_000]
+    _, last = topics["/joint_states"][2]
+    assert last.timestamp.ToNanoseconds() == 100_000_000
+    assert [joint.name for joint in last.joints] == list(spec.joint_names)
+    assert [joint.position for joint in last.joints] == episode.columns[s.STATE][2].tolist()
+    scalars = {scalar["label"]: scalar["value"] for scalar in topics["/scalars"][2][1]["scalars"]}
+    assert scalars[s.SUCCESS] == 1
+    assert scalars[s.REWARD] == episode.columns[s.REWARD][2].item()
+    assert scalars[s.EXPERT_PHASE] == episode.columns[s.EXPERT_PHASE][2]
 
 
 _RECORDER = """

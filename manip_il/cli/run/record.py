@@ -58,5 +58,5 @@ def run_record(options: RecordOptions) -> None:
         f"recorded {episodes:,} successful episodes, {frames:,} frames; demonstrations left out:"
         f" {failed}"
     )
-    say(f"dataset: {root} (single episodes: {journals})")
+    say(f"dataset: {root} (single episodes, to open in Foxglove: {journals})")
     say_next("train", f"--dataset.root={root}", f"--output_dir=runs/{root.name}")
