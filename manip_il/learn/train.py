@@ -43,11 +43,15 @@ from manip_il.learn.lerobot_policy import build_policy, build_processors, load_p
 from manip_il.learn.names import OWN_SPACE, PLAIN
 from manip_il.learn.network import threads
 from manip_il.learn.paraphrases import rephrased
-from manip_il.learn.samples import TASK, Batch, Samples, load_data, rabc_weights
-from manip_il.learn.sources import (
+from manip_il.learn.samples import (
+    TASK,
+    Batch,
+    Samples,
     check_same_sources,
     check_shares,
     input_columns,
+    load_data,
+    rabc_weights,
     recorded_look,
     row_weights,
 )

@@ -23,7 +23,7 @@ from manip_il.robots.geometry import Body, at_tip, hand_down, nearest, outline, 
 from manip_il.robots.gripper import finger_geoms, set_time_step
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import EndEffector, ModelFiles, Robot
-from manip_il.robots.spec import arm_spec, bare_spec, joint_range, load, require
+from manip_il.robots.spec import arm_model, arm_spec, bare_spec, joint_range, load, require
 
 FORCE = 200.0  # torque limit of an arm joint whose model sets none [N m]
 ARMATURE = 0.1  # armature of an arm joint whose model has none [kg m^2]
@@ -41,6 +41,8 @@ _STARTS, _STEPS = 40, 150  # inverse kinematics: number of random postures, and 
 _LONGEST = 0.2  # longest step of a joint [rad]
 # height of the hand over the table, or half the workspace's height if that is less [m]
 _HIGHEST = 0.2
+# a root body nearer than this to where it would stand best needs no other `base` [m]
+_ON_PLACE = 0.05
 _LOWER = (1.0, 0.7, 0.4)  # shares of that height, tried in order
 _ARRIVED = 0.01  # tolerated pose error [m], a radian counting as 5 cm
 _ANGLE_AS_LENGTH = 0.05
@@ -216,8 +218,22 @@ def find_home(robot: Robot, turns: bool) -> Robot:
     mount = " gripper.quaternion (how the gripper is mounted)," if robot.gripper.files else ""
     raise UsageError(
         f"robot {robot.name}: the hand cannot point down over the workspace's centre ({x:g},"
-        f" {y:g}); check workspace.centre,{mount} hand and base, or set home"
+        f" {y:g}); check workspace.centre,{mount} hand and base, or set home{_stance(robot)}"
     )
+
+
+def _stance(robot: Robot) -> str:
+    """Propose the `base` on the table from which an arm whose model stands high or turned faces
+    the workspace.
+    """
+    model, ahead = arm_model(robot), np.zeros(3)
+    mujoco.mju_rotVecQuat(ahead, np.eye(3)[0], model.body_quat[1])
+    root, centre = model.body_pos[1], np.array([*robot.workspace.centre, 0.0])
+    base = centre - np.linalg.norm((centre - root)[:2]) * ahead * [1, 1, 0]
+    if np.allclose(base, root, atol=_ON_PLACE):
+        return ""
+    stands = f"the model's root stands at {_rounded(root, 2)} and faces {_rounded(ahead, 2)}"
+    return f"; {stands}: try base: {list(_rounded(base, 2))}"
 
 
 def _rounded(values: F64, digits: int) -> Any:

@@ -20,7 +20,7 @@ from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFin
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.sources import check_same_sources
+from manip_il.learn.samples import check_same_sources
 from manip_il.learn.train import Trainer
 from manip_il.learn.training_state import METRICS_FILE
 

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from manip_il.collect.job import RolloutJob
+from manip_il.errors import UsageError
 from manip_il.robots.geometry import angle_across, angle_off_vertical
 from manip_il.robots.gripper import sweep
 from manip_il.robots.ik import ArmIK
@@ -16,7 +18,7 @@ from manip_il.seeding import stream_seeds
 from manip_il.worlds.table import make_config
 
 from ..scenes import started, still
-from .own import ARM, EXAMPLES, JAWS, tree_of, write
+from .own import ARM, EXAMPLES, JAWS, model_of, tree_of, write
 
 SEEDS = stream_seeds("validation", 4)
 every_example = pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
@@ -79,6 +81,17 @@ def test_what_the_yaml_says_is_not_sought(tmp_path: Path):
     assert robot.home == tuple(said["home"])
     assert robot.gains == tuple(said["gains"])
     assert robot.armature == (0.3,) * 5
+
+
+@pytest.mark.parametrize("stance", ['pos="0 0 0.8"', 'euler="0 0 3.14159"'], ids=["high", "turned"])
+def test_the_base_that_is_proposed_for_an_arm_out_of_reach_has_the_workspace_within_reach(
+    stance: str, tmp_path: Path
+):
+    model = model_of().replace('<body name="base">', f'<body name="base" {stance}>')
+    with pytest.raises(UsageError, match="try base: ") as refused:
+        read_robot(write(tmp_path, tree=short(), model=model))
+    base = yaml.safe_load(str(refused.value).partition("try base: ")[2])
+    assert read_robot(write(tmp_path, tree=short(base=base), model=model)).base == tuple(base)
 
 
 def test_limits_of_motors_are_those_of_the_model(tmp_path: Path):

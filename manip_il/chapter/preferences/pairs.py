@@ -33,7 +33,7 @@ from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import in_one_line
-from manip_il.learn.sources import check_same_sources
+from manip_il.learn.samples import check_same_sources
 from manip_il.mdp import F32, F64, I64, require_finite
 from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.worlds.fingerprint import canonical_json

@@ -14,7 +14,7 @@ from manip_il.cli.outputs import Stages, about, say
 from manip_il.cli.run.imitation import say_best
 from manip_il.collect.inputs import open_dataset
 from manip_il.learn.checkpoint import Origin, find_policy
-from manip_il.learn.sources import check_same_sources
+from manip_il.learn.samples import check_same_sources
 from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.worlds.table import env_spec, stored_config
 
