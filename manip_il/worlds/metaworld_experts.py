@@ -277,6 +277,7 @@ EXPERTS: dict[str, Expert] = {
     "push-wall-v3": _wall,
     "push-back-v3": _carry,
     "shelf-place-v3": _place(0.03, 0.03),
+    "soccer-v3": _place(0.015, 0.0, around=0.03),  # the ball is held
     "stick-pull-v3": _stick_pull,
     "stick-push-v3": _stick_push,
     "sweep-v3": _carry,
