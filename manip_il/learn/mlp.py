@@ -129,8 +129,6 @@ class MLPPolicy(PreTrainedPolicy):
         if config.reads_text is None:
             tasks = getattr(dataset_meta, "tasks", None)
             config.reads_text = tasks is not None and len(tasks) > 1
-        if dataset_meta is not None:
-            config.skips_absent = config.reads_text
         if config.scales and not config.scaled and dataset_meta is not None:
             reads = ENVIRONMENT_STATE in self.inputs or getattr(config, "aux_weight", 0) > 0
             config.scaled = self._offsets(offsets_of(dataset_meta.features if reads else {}))

@@ -60,8 +60,6 @@ class NetworkConfig:
             the robot.
         reads_text: Whether the network reads the task's text; None if it does where the dataset has
             several.
-        skips_absent: Whether a 0 in the environment state means that a task lacks the number, so
-            that it has no share in the statistics; set where the network reads texts.
 
     Raises:
         UnknownName: The loss, the activation or the action space is unknown.
@@ -81,7 +79,6 @@ class NetworkConfig:
     scaled: tuple[int, ...] = ()
     grippers: tuple[int, ...] = LAST
     reads_text: bool | None = None
-    skips_absent: bool = False
 
     def __post_init__(self) -> None:
         check_bounds(self, "policy.")
@@ -147,10 +144,9 @@ def fit_statistics(inputs: F32, targets: F32, loss: str) -> Statistics:
 
 
 def _mean_and_deviation(values: F32) -> tuple[F64, F64]:
-    """Return mean and standard deviation of each column; 0 if all of it is masked."""
+    """Return mean and standard deviation of each column."""
     mean = values.mean(0, dtype=np.float64)
-    deviation = np.sqrt(np.square(values - mean).mean(0))
-    return np.ma.filled(mean, 0.0), np.ma.filled(deviation, 0.0)
+    return mean, np.sqrt(np.square(values - mean).mean(0))
 
 
 def inverse(scale: Tensor) -> Tensor:
@@ -207,7 +203,6 @@ class MLPNetwork(nn.Module):
         self.clamp = config.clamp
         self.loss = config.loss
         self.adds = config.action_space == JOINT_DELTA
-        self.skips_absent = config.skips_absent
         added = torch.full((n,), float(config.action_space == JOINT_DELTA))
         added[list(config.grippers)] = 0.0
         self.register_buffer("added", added, persistent=False)
@@ -239,12 +234,8 @@ class MLPNetwork(nn.Module):
 
     def learn_statistics(self, inputs: Tensor, actions: Tensor) -> None:
         """Set the statistics to those of raw inputs (N, n + k) and absolute actions (N, n)."""
-        targets, numbers = self.relative(actions, inputs).numpy(), self.expanded(inputs)
-        if self.skips_absent:
-            known = np.ma.masked_array(numbers.numpy(), self._absent(numbers).numpy())
-        else:
-            known = numbers.numpy()
-        self.set_statistics(fit_statistics(known, targets, self.loss))
+        targets = self.relative(actions, inputs).numpy()
+        self.set_statistics(fit_statistics(self.expanded(inputs).numpy(), targets, self.loss))
 
     def expanded(self, inputs: Tensor) -> Tensor:
         """Return the numbers among the inputs, (B, n + k), with tanh(offset / scale) appended for
@@ -259,15 +250,9 @@ class MLPNetwork(nn.Module):
 
     def encode(self, inputs: Tensor) -> Tensor:
         """Return the perceptron's normalised inputs for raw inputs (B, n + k)."""
-        numbers = self.expanded(inputs)
-        found = ((numbers - self.input_mean) * self.input_scale).clamp(-self.clamp, self.clamp)
-        return found.masked_fill(self._absent(numbers), 0.0) if self.skips_absent else found
-
-    def _absent(self, numbers: Tensor) -> Tensor:
-        """Return which inputs a task lacks, (B, n + k): zeros behind those of the robot."""
-        absent = numbers == 0
-        absent[:, : self.n] = False
-        return absent
+        return ((self.expanded(inputs) - self.input_mean) * self.input_scale).clamp(
+            -self.clamp, self.clamp
+        )
 
     def encode_targets(self, targets: Tensor) -> Tensor:
         """Return normalised targets (B, n) for raw targets (B, n), as from `relative`.

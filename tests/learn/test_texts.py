@@ -11,7 +11,6 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.learn.export import export_onnx
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.mlp import MLPPolicy
-from manip_il.learn.network import MLPNetwork, NetworkConfig
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.texts import LENGTH, tokens
 from manip_il.learn.train import Trainer
@@ -79,13 +78,3 @@ def test_the_text_decides_where_nothing_else_does(policy, dataset):
 def test_one_that_reads_is_not_exported(policy):
     with pytest.raises(ManipError, match="reads the task's text"):
         export_onnx(policy)
-
-
-def test_numbers_that_a_task_lacks_have_no_share_in_the_statistics():
-    network = MLPNetwork(3 + LENGTH, 2, NetworkConfig(reads_text=True, skips_absent=True))
-    numbers = torch.tensor([[0.0, 1.0, 0.5], [0.0, 1.0, 0.7], [2.0, 3.0, 0.0], [2.0, 3.0, 0.0]])
-    inputs = torch.cat([numbers, tokens(["a"] * 4)], dim=1)
-    network.learn_statistics(inputs, torch.zeros(4, 2))
-    torch.testing.assert_close(network.input_mean, torch.tensor([1.0, 2.0, 0.6]))
-    torch.testing.assert_close(network.encode(inputs)[:, 2], torch.tensor([-1.0, 1.0, 0.0, 0.0]))
-    assert network.encode(inputs)[0, 0] == -1  # the robot's own zero is a number
