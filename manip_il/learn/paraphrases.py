@@ -41,10 +41,10 @@ def paraphrases(text: str, held_out: bool = False) -> list[str]:
             if word.search(plain):
                 forms = [word.sub(other, form) for form in forms for other in synonyms]
                 break
-    made = [before + form for form in dict.fromkeys(forms) for before in _BEFORE]
-    made.sort(key=lambda one: zlib.crc32(one.encode()))
-    chosen = [one for one in made if (zlib.crc32(one.encode()) % _APART == 0) == held_out]
-    return chosen if held_out else [text, *chosen]
+    made = {before + form for form in forms for before in _BEFORE} - {plain}
+    ordered = sorted(made, key=lambda one: (zlib.crc32(one.encode()), one))
+    first = -(-len(ordered) // _APART)
+    return ordered[:first] if held_out else [text, *ordered[first:]]
 
 
 def rephrased(texts: Sequence[str], seed: Sequence[int]) -> list[str]:

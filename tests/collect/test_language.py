@@ -169,10 +169,10 @@ def test_held_out_texts_are_other_texts_and_all_are_the_same_everywhere():
     text = "Pick up the cube and bring it to the green goal."
     trained, tested = paraphrases(text), paraphrases(text, True)
     assert trained[0] == text
-    assert len(trained) > 20
-    assert len(tested) > 5
+    assert [len(trained), len(tested)] == [54, 18]
     assert not {*trained} & {*tested}
-    assert trained[1:3] == paraphrases(text)[1:3]
+    assert trained[1] == "task: grab the cube and carry it to the green goal"
+    assert paraphrases("The blue cube goes into the blue bin.", True)
 
 
 @pytest.mark.parametrize(
