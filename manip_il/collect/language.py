@@ -82,7 +82,7 @@ def language_columns(
         spec: The dataset's, which names its cameras and keypoints.
         episode: Its states, labels, actors, successes and keypoints.
     """
-    told = Told.of(env, spec, episode)
+    told = EpisodeTexts.of(env, spec, episode)
     persistent = sorted(told.persistent(), key=lambda row: row["timestamp"])
     events: list[list[Row]] = [[] for _ in range(len(told.subtasks))]
     for frame, row in told.events():
@@ -95,7 +95,7 @@ def language_columns(
 
 
 @dataclass(frozen=True)
-class Told:
+class EpisodeTexts:
     """What is told of an episode.
 
     Attributes:
@@ -123,7 +123,7 @@ class Told:
     keypoints: Mapping[str, NDArray[Any]]
 
     @classmethod
-    def of(cls, config: EnvConfig, spec: EnvironmentSpec, episode: EpisodeData) -> Told:
+    def of(cls, config: EnvConfig, spec: EnvironmentSpec, episode: EpisodeData) -> EpisodeTexts:
         """Restore every state of an episode, and ask its world for words.
 
         Args:
@@ -222,12 +222,16 @@ class Told:
         """Return what is left at a frame, as a numbered list. Of an episode that failed, only what
         comes next is known.
         """
-        left = self._done_in(frame, len(self.subtasks)) if self.solved else [self.subtasks[frame]]
+        left = (
+            self._without_repeats(frame, len(self.subtasks))
+            if self.solved
+            else [self.subtasks[frame]]
+        )
         return "\n".join(f"{number}. {text}" for number, text in enumerate(left, 1))
 
     def memory(self, frame: int) -> str:
         """Return what is done at a frame."""
-        done = self._done_in(0, frame + 1)[:-1]
+        done = self._without_repeats(0, frame + 1)[:-1]
         return f"Done: {'; '.join(done)}." if done else "Nothing is done yet."
 
     def questions(self, frame: int, points: Sequence[Any]) -> list[tuple[str, dict[str, Any]]]:
@@ -275,7 +279,7 @@ class Told:
         height, width = self.spec.image_size
         return [int(point[0] * width), int(point[1] * height)]
 
-    def _done_in(self, start: int, stop: int) -> list[str]:
+    def _without_repeats(self, start: int, stop: int) -> list[str]:
         """Return the subtasks from one frame to another, in order, without what was repeated."""
         found: list[str] = []
         for text in self.subtasks[start:stop]:

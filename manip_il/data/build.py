@@ -214,9 +214,12 @@ def merge_datasets(
     opened = [Dataset.open(source) for source in roots]
     kept = choose_episodes(episodes, sum(one.info.episodes for one in opened))
     if joined := JoinedTasks.of(opened, provenance or {}):
+        for one in opened:
+            _check_same_facts(opened[0], one, ("film ", "meta/"))
         chosen = (one for number, one in enumerate(joined.episodes()) if number in kept)
         about = opened[0].fps, opened[0].info.robot, joined.own
-        return write_episodes(chosen, root, joined.features, *about, replace=replace)
+        tables = opened[0].other_tables
+        return write_episodes(chosen, root, joined.features, *about, tables=tables, replace=replace)
     own = _merged_description(opened, provenance or {})
     features: layout.Features = {}
     for one in opened:
@@ -280,10 +283,12 @@ def _merged_description(opened: Sequence[Dataset], provenance: Mapping[str, Any]
     return Own(spec, own, {**provenance, "merged": sources})
 
 
-def _check_same_facts(left: Dataset, right: Dataset) -> None:
-    """Raise `MismatchError` unless two datasets can be merged."""
+def _check_same_facts(left: Dataset, right: Dataset, kinds: tuple[str, ...] = ("",)) -> None:
+    """Raise `MismatchError` unless two datasets can be merged. kinds: which facts to compare, by
+    the beginnings of their names.
+    """
     ours, theirs = _facts(left), _facts(right)
-    for what in {**ours, **theirs}:
+    for what in filter(lambda name: name.startswith(kinds), {**ours, **theirs}):
         one, other = ours.get(what, "none"), theirs.get(what, "none")
         # no film, or not described as fully
         is_unknown = what.startswith("film ") and "none" in (one, other)

@@ -3,6 +3,7 @@
 And mistakes, in one line without secrets.
 """
 
+import gzip
 import hashlib
 import json
 import os
@@ -14,8 +15,9 @@ import pytest
 from huggingface_hub import constants
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from s3fs import S3FileSystem
 
-from manip_il.bridges.store.manifest import Manifest
+from manip_il.bridges.store.manifest import Arrival, Manifest
 from manip_il.bridges.store.transfer import open_remote, pull, push
 from manip_il.cli.main import main
 from manip_il.errors import ManipError
@@ -115,11 +117,105 @@ def test_whatever_a_manifest_holds_nothing_outside_the_folder_is_read_or_written
             )
 
 
+@pytest.mark.parametrize("endless", ["manifest", "object"])
+@pytest.mark.parametrize("scheme", ["file", "s3", pytest.param("sftp", marks=pytest.mark.slow)])
+def test_a_file_that_is_larger_than_the_list_says_is_not_taken(
+    scheme, endless, tmp_path, monkeypatch, request
+):
+    """An endless device where the store can hold one, else many times the size."""
+    most = 5_000_000
+    monkeypatch.setattr("manip_il.checks.LARGEST_READ", most)
+    run, store = make_run(tmp_path / "run"), tmp_path / "store"
+    url = f"file://{store}"
+    if scheme == "sftp":
+        server = request.getfixturevalue("sshd")
+        monkeypatch.setenv("HOME", str(server.home))
+        url = server.url(store)
+    if scheme == "s3":
+        url = request.getfixturevalue("bucket")
+    push(run, open_remote(url, quiet=True))
+    name = "manip_il_manifest.json"
+    if endless == "object":
+        sha256 = hashlib.sha256((run / "new.txt").read_bytes()).hexdigest()
+        name = f"objects/{sha256[:2]}/{sha256}"
+    if scheme == "s3":
+        S3FileSystem(endpoint_url=os.environ["AWS_ENDPOINT_URL"]).pipe_file(
+            f"{url}/{name}", bytes(4 * most)
+        )
+    else:
+        (store / name).unlink()
+        (store / name).symlink_to("/dev/zero")
+    arrived = []
+    monkeypatch.setattr(
+        Arrival, "call", lambda self, call=Arrival.call: arrived.append(self.value) or call(self)
+    )
+    with pytest.raises(ManipError):
+        pull(open_remote(url, quiet=True), tmp_path / "got")
+    assert scheme == "file" or 0 < max(arrived) < 2 * most
+    assert not list(tmp_path.glob("*got*"))
+
+
+@pytest.mark.parametrize("how", ["larger", "compressed"])
+def test_a_hub_that_sends_more_than_it_lists_is_not_listened_to(
+    how: str, hub: Hub, tmp_path: Path, monkeypatch
+):
+    push(make_run(tmp_path / "run"), open_remote(POLICY, quiet=True))
+    most = 50_000_000
+    body = bytes(most) if how == "larger" else gzip.compress(bytes(most))
+    hub.change = lambda line, data: body if line.startswith("GET") and "resolve" in line else data
+    hub.headers = lambda line: (
+        {"Content-Encoding": "gzip"} if how == "compressed" and "GET" in line else {}
+    )
+    if how == "compressed":
+        change = hub.change
+        hub.change = lambda line, data: (
+            gzip.compress(data) if "GET" in line and "api" in line else change(line, data)
+        )
+    arrived = []
+    monkeypatch.setattr(
+        Arrival, "call", lambda self, call=Arrival.call: arrived.append(self.value) or call(self)
+    )
+    with pytest.raises(ManipError, match="more than"):
+        pull(open_remote(POLICY, quiet=True), tmp_path / "got")
+    assert max(arrived) < most
+    assert not list(tmp_path.glob("*got*"))
+
+
+@pytest.mark.parametrize("asked", ["/api/models/user/policy?", "/tree/", "/commit/"])
+def test_an_answer_without_an_end_is_not_read_to_it(
+    asked: str, hub: Hub, tmp_path: Path, monkeypatch
+):
+    run, most = make_run(tmp_path / "run"), 5_000_000
+    push(run, open_remote(POLICY, quiet=True))
+    (run / "new.txt").write_text("new")
+    monkeypatch.setattr("manip_il.checks.LARGEST_READ", most)
+    hub.change = lambda line, body: (
+        gzip.compress(body + b" " * 10 * most) if asked in line else body
+    )
+    hub.headers = lambda line: {"Content-Encoding": "gzip"} if asked in line else {}
+    with pytest.raises(ManipError, match="sends more than"):
+        push(run, open_remote(POLICY, quiet=True))
+
+
 def test_a_pipe_in_the_place_of_a_manifest_does_not_hang(tmp_path: Path):
     (tmp_path / "store").mkdir()
     os.mkfifo(tmp_path / "store" / "manip_il_manifest.json")
     with pytest.raises(ManipError, match="not a regular file"):
         pull(open_remote(f"file://{tmp_path}/store", quiet=True), tmp_path / "got")
+
+
+def test_a_list_that_lacks_files_of_the_commit_is_refused(hub: Hub, tmp_path: Path):
+    push(SAMPLE, open_remote(DATASET, quiet=True))
+    hub.change = lambda line, body: (
+        without(body, "data/chunk-000/file-000.parquet") if "/tree/" in line else body
+    )
+    with pytest.raises(ManipError, match=r"lacks 'data/chunk-000/file-000\.parquet'"):
+        pull(open_remote(DATASET, quiet=True), tmp_path / "got")
+    assert not list(tmp_path.glob("*got*"))
+
+
+def without(body: bytes, path: str) -> bytes:
+    return json.dumps([one for one in json.loads(body) if one["path"] != path]).encode()
 
 
 def test_the_token_goes_to_the_hub_alone(hub: Hub, tmp_path: Path):

@@ -14,6 +14,8 @@ and the checks. The guarantees, and the tests in `tests/store` for them:
 - Nothing of others is replaced or deleted:
   `test_a_push_removes_what_the_manifest_before_lists_...`,
   `test_what_others_keep_in_a_repository_stays_...`.
+- No more arrives than the remote lists: `test_a_file_that_is_larger_than_the_list_says_...`,
+  `test_an_answer_without_an_end_...`.
 - A dataset is checked first, and links are not followed:
   `test_a_dataset_is_examined_before_its_push_and_...`.
 - Unknown hosts are refused, and an error is one line: `test_a_mistake_is_one_line`.

@@ -13,7 +13,9 @@ neither our licence nor our authorship.
 import re
 import shlex
 import tempfile
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Generator, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -43,6 +45,7 @@ from manip_il.bridges.store.manifest import (
     CARD,
     CONFIG,
     MANIFEST_FILE,
+    Arrival,
     File,
     Kind,
     Manifest,
@@ -63,6 +66,7 @@ _HIDDEN = re.compile(r"(.*/)?\.[^./]")  # such as the Hub's own .gitattributes
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _OF_A_DATASET = ("data/", "meta/", "videos/")  # the layout's folders, which are replaced as one
 _OURS = b"<!-- written by manip-il push -->"  # a card with this line is ours and is replaced
+_ANSWERS = ContextVar[Arrival | None]("_ANSWERS", default=None)  # of the action in progress
 
 
 def _guard_token(request: httpx.Request) -> None:
@@ -74,15 +78,40 @@ def _guard_token(request: httpx.Request) -> None:
         request.headers.pop("authorization", None)
 
 
+def _count(response: httpx.Response) -> None:
+    """Count an answer's bytes, as decompressed, whoever reads it."""
+    arrival, chunks = _ANSWERS.get() or Arrival(checks.LARGEST_READ), response.iter_bytes
+
+    def counted(chunk_size: int | None = None) -> Iterator[bytes]:
+        for chunk in chunks(chunk_size):
+            arrival.update(len(chunk))
+            yield chunk
+
+    response.iter_bytes = counted
+
+
+@contextmanager
+def _bounded(size: int = 0) -> Generator[None]:
+    """Bound all answers in this block together. size: of the file that they bring."""
+    token = _ANSWERS.set(Arrival(checks.LARGEST_READ + size))
+    try:
+        yield
+    finally:
+        _ANSWERS.reset(token)
+
+
 @cache
 def _use_client() -> None:
-    """Have huggingface_hub guard the token from now on."""
+    """Have huggingface_hub guard the token and count what arrives from now on."""
     set_client_factory(_client)
 
 
 def _client() -> httpx.Client:
     client = default_client_factory()
-    client.event_hooks["request"].append(_guard_token)
+    client.event_hooks = {
+        "request": [*client.event_hooks["request"], _guard_token],
+        "response": [_count],
+    }
     return client
 
 
@@ -143,7 +172,7 @@ class Hub:
 
     def read(self) -> Manifest | None:
         """Return the current version; None if the repository or the revision does not exist."""
-        with explained(f"read {self.name}"):
+        with explained(f"read {self.name}"), _bounded():
             try:
                 about: Any = self._api.repo_info(**self._repo, revision=self._revision)
             except (RepositoryNotFoundError, RevisionNotFoundError):
@@ -155,6 +184,12 @@ class Hub:
                 )
             tree = self._api.list_repo_tree(**self._repo, revision=head, recursive=True)
             listed = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
+            if missing := {entry.rfilename for entry in about.siblings or ()} - listed.keys():
+                text = (
+                    f"its list of files lacks {checks.shorten(min(missing))}, which the commit has;"
+                    " try again"
+                )
+                raise RemoteError(f"{self.name}: {text}")
             files = {
                 path: (
                     File(entry.lfs.size, entry.lfs.sha256)
@@ -226,7 +261,7 @@ class Hub:
         """Commit on top of `plan.before` (the Hub refuses if it is outdated), then move a
         dataset's tag.
         """
-        with explained(f"push to {self.name}"):
+        with explained(f"push to {self.name}"), _bounded():
             before, gone = plan.before or self._create(), plan.remove
             if plan.before is None:  # a new branch begins with the files of the main branch
                 gone = sorted(
@@ -252,9 +287,16 @@ class Hub:
             manifest: The version.
             folder: Where the file is written, at the same path as in the repository.
             path: The file's path in the repository.
+
+        Raises:
+            RemoteError: if the server sends more bytes than expected.
         """
+        file = manifest.files.get(path)
+        most = file.size if file else checks.LARGEST_READ
         where: Any = {**self._repo, "revision": manifest.version, "local_dir": folder}
-        self._api.hf_hub_download(filename=path, force_download=True, **where)
+        where["tqdm_class"] = Arrival(most)  # some servers send a file by other means than answers
+        with _bounded(most):
+            self._api.hf_hub_download(filename=path, force_download=True, **where)
 
     def _create(self) -> Manifest:
         """Create the repository and the branch.

@@ -1,4 +1,7 @@
-"""The files of one version of a dataset or run, with sizes and hashes."""
+"""The files of one version of a dataset or run, with sizes and hashes.
+
+`Arrival` counts their bytes as they are downloaded.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,9 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, override
+
+from fsspec.callbacks import Callback
 
 from manip_il import checks
 from manip_il.bridges.store.errors import RemoteError
@@ -145,6 +150,34 @@ class PushPlan:
     local: Mapping[str, Path]
     upload: list[str]
     remove: list[str]
+
+
+class Arrival(Callback):
+    """Counts the bytes of one file. Raises `RemoteError` as soon as they are more than `most`.
+
+    fsspec updates it as a callback. huggingface_hub calls it for a new progress bar, and updates
+    that.
+    """
+
+    def __init__(self, most: int):
+        super().__init__()
+        self.most = most
+
+    @override
+    def call(self, *hook: Any, **given: Any) -> None:
+        """Raise `RemoteError` if there are too many bytes."""
+        if self.value > self.most:
+            raise RemoteError(
+                f"it sends more than the {self.most:,} bytes that were expected; nothing was kept"
+            )
+
+    def __call__(self, *given: Any, **options: Any) -> Arrival:
+        """Return the bar, for huggingface_hub."""
+        return self
+
+    def update(self, count: float | None = 1) -> None:
+        """Count more bytes."""
+        self.relative_update(int(count or 0))
 
 
 def check_path(path: object) -> None:

@@ -12,11 +12,10 @@ import hashlib
 import logging
 import re
 import secrets
-import shutil
 import tempfile
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, override
 from urllib.parse import unquote
@@ -29,7 +28,7 @@ from fsspec.implementations.sftp import SFTPFileSystem
 
 from manip_il import checks
 from manip_il.bridges.store.errors import RemoteError, explained
-from manip_il.bridges.store.manifest import MANIFEST_FILE, Kind, Manifest, PushPlan
+from manip_il.bridges.store.manifest import MANIFEST_FILE, Arrival, Kind, Manifest, PushPlan
 from manip_il.errors import UnknownName, UsageError
 
 TIMEOUT = 30.0  # for connecting to an ssh server, and for each response [s]
@@ -45,6 +44,7 @@ _SFTP = re.compile(
 # sends
 _AT_ONCE = 10
 _SENT_AT_ONCE = 5
+_CHUNK = 2**20  # [bytes]
 
 
 class Local(LocalFileSystem):
@@ -52,23 +52,19 @@ class Local(LocalFileSystem):
 
     @override
     def get_file(self, path1: Any, path2: Any, callback: Any = None, **kwargs: Any) -> None:
-        """Copy a file.
+        """Copy a file and count its bytes.
 
         Args:
             path1: The file to copy.
             path2: The new file.
-            callback: Ignored.
+            callback: The `Arrival` that counts the bytes.
             kwargs: Ignored.
 
         Raises:
-            RemoteError: if it is not a regular file.
+            RemoteError: if it is not a regular file, or has more bytes than expected.
         """
-        what = "a file of a push"
-        with (
-            checks.open_outside(Path(path1), what, RemoteError) as source,
-            open(path2, "wb") as file,
-        ):
-            shutil.copyfileobj(source, file)
+        with checks.open_outside(Path(path1), "a file of a push", RemoteError) as source:
+            _copy(source, path2, callback)
 
 
 class Sftp(SFTPFileSystem):
@@ -118,6 +114,30 @@ class Sftp(SFTPFileSystem):
         """
         self.makedirs(self._parent(rpath), exist_ok=True)
         self.ftp.put(str(lpath), str(rpath))
+
+    @override
+    def get_file(self, rpath: Any, lpath: Any, callback: Any = None, **kwargs: Any) -> None:
+        """Download a file and count its bytes.
+
+        Args:
+            rpath: The path on the server.
+            lpath: The new file on this machine.
+            callback: The `Arrival` that counts the bytes.
+            kwargs: Ignored.
+
+        Raises:
+            RemoteError: if the file has more bytes than expected.
+        """
+        with self.ftp.open(str(rpath)) as source:
+            source.prefetch(min(source.stat().st_size or 0, callback.most))
+            _copy(source, lpath, callback)
+
+
+def _copy(source: Any, target: str, arrival: Arrival) -> None:
+    with open(target, "wb") as file:
+        for chunk in iter(partial(source.read, _CHUNK), b""):
+            arrival.update(len(chunk))
+            file.write(chunk)
 
 
 class Objects:
@@ -179,8 +199,10 @@ class Objects:
             except (FileNotFoundError, NotADirectoryError):
                 return None
             with tempfile.NamedTemporaryFile() as arrived:
-                self._fs.get_file(self._manifest, arrived.name)
-                data = checks.read_bytes(Path(arrived.name), "a manifest")
+                self._fs.get_file(
+                    self._manifest, arrived.name, callback=Arrival(checks.LARGEST_READ)
+                )
+                data = arrived.read()
             return Manifest.from_json(data, info.get("ETag") or hashlib.sha256(data).hexdigest())
 
     def write(self, plan: PushPlan) -> None:
@@ -231,8 +253,14 @@ class Objects:
             manifest: The version that the file belongs to.
             folder: Where the file is written, at its own path.
             path: The file's path in the manifest.
+
+        Raises:
+            RemoteError: if the server sends more bytes than the manifest says.
         """
-        self._fs.get_file(self._object(manifest.files[path].sha256), str(folder / path))
+        file = manifest.files[path]
+        self._fs.get_file(
+            self._object(file.sha256), str(folder / path), callback=Arrival(file.size)
+        )
 
     def _switch(self, new: Manifest, before: str) -> None:
         """Replace the manifest if its version is still `before`: on S3 atomically, elsewhere
