@@ -28,10 +28,10 @@ from manip_il.data.dataset import UNKNOWN_TASK, Dataset, EpisodeData, Own
 from manip_il.data.episodes import to_episode
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.info import Info
-from manip_il.data.lerobot_layout import OURS, Features
+from manip_il.data.lerobot_layout import OURS, TASK_INDEX, Features
 from manip_il.data.lerobot_write import write_dataset, write_episodes
 from manip_il.errors import ManipError, MismatchError, NothingToLearnError
-from manip_il.mdp import F64, Actor, Episode, Label, Observation, State, Transition
+from manip_il.mdp import F64, I64, Actor, Episode, Label, Observation, State, Transition
 from manip_il.option import NameOrPath
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition, draw
@@ -81,21 +81,25 @@ class Scenes:
         """
         return stream_seeds("redraw", self.first + self.frames, self.seed)[self.first :]
 
-    def chunks(self, states: F64, leads: F64) -> Iterator[tuple[int, F64, F64]]:
+    def chunks(self, states: F64, leads: F64, tasks: I64) -> Iterator[tuple[int, F64, F64]]:
         """Yield the visited states from which scenes are drawn, in pieces of `CHUNK` scenes.
 
         Args:
             states: Rows of `sim_state`, (S, m). They are used in an order drawn from the seed, and
                 repeatedly if there are more scenes than states.
             leads: Offset added to the label of each state's scene, (S, n).
+            tasks: Number of each state's task, (S,). Scenes of one task follow each other, as what
+                draws another takes a while to prepare.
 
         Yields:
             The number of the first scene, the visited states (C, m), and the offsets (C, n).
         """
         order = rng_for(self.seed, "order of redrawn states").permutation(len(states))
+        chosen = order[np.arange(self.frames) % len(states)]
+        chosen = chosen[np.argsort(tasks[chosen], kind="stable")]
         for at in range(0, self.frames, CHUNK):
-            rows = np.arange(at, min(at + CHUNK, self.frames)) % len(states)
-            yield self.numbers[at], states[order[rows]], leads[order[rows]]
+            rows = chosen[at : at + CHUNK]
+            yield self.numbers[at], states[rows], leads[rows]
 
 
 class SceneDrawer:
@@ -335,7 +339,7 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
     """Write a dataset of new scenes made from the states of `source`.
 
     Each frame or branch is an episode. The same seed gives the same scenes, and a larger number of
-    frames only adds scenes at the end.
+    frames only adds scenes, at the end if there is one task.
 
     Args:
         source: The dataset whose states are changed into scenes.
@@ -357,7 +361,9 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
         spec.require("redrawn", "give --scenes=false")
     if scenes.conditions:
         spec.require("varied", "leave out --vary")
-    columns = source.dataset.columns([schema.SIM_STATE, schema.ACTION, schema.LABEL_VALID])
+    columns = source.dataset.columns(
+        [schema.SIM_STATE, schema.ACTION, schema.LABEL_VALID, TASK_INDEX]
+    )
     drawn = {
         "scenes": scenes.anew,
         "branch_steps": scenes.branch_steps,
@@ -373,7 +379,9 @@ def redraw_dataset(source: EditSource, scenes: Scenes, target: EditTarget) -> In
     provenance = {"redrawn": {**_origin(source), **drawn, **vary}, **tried}
     spec = replace(spec, video=False)  # frames are independent scenes
     fingerprint = env_fingerprint(source.env, scenes.cameras)
-    pieces = scenes.chunks(columns[schema.SIM_STATE], _leads(source, columns))
+    pieces = scenes.chunks(
+        columns[schema.SIM_STATE], _leads(source, columns), columns[TASK_INDEX].reshape(-1)
+    )
 
     def episodes() -> Iterator[Episode]:
         empty = True

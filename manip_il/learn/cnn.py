@@ -53,8 +53,10 @@ class CNNConfig(MLPConfig):
     fast. Acting is always in single precision. All options that are not listed are the mlp's.
 
     Args:
-        channels: Number in each convolutional layer; the first two layers halve the picture's
-            sides, the others keep them.
+        channels: Number in each convolutional layer; the first layer divides the picture's sides
+            by `stride`, the second one halves them, the others keep them.
+        stride: Pixels between neighbouring windows of the first layer, whose sides are
+            2 * stride + 1; 4 for pictures of 192 pixels.
         keypoints: Number per camera.
         aux_weight: Weight of the loss of a second perceptron, which predicts
             `observation.environment_state` from joints and keypoints if the dataset has it and it
@@ -77,6 +79,7 @@ class CNNConfig(MLPConfig):
     """
 
     channels: tuple[int, ...] = (16, 32, 32, 32)
+    stride: int = option(2, "pixels between windows of the first layer", at_least=1, at_most=16)
     keypoints: int = option(32, "keypoints per camera", at_least=1, at_most=1024)
     aux_weight: float = option(0.5, "weight of the loss of the predicted state", at_least=0)
     states: str = option(
@@ -172,7 +175,10 @@ class CNNPolicy(MLPPolicy):
         features, size = config.input_features or {}, config.privileged_size
         n = features[STATE].shape[0]
         self.encoders = nn.ModuleList(
-            [KeypointEncoder(config.channels, config.keypoints) for _ in self.cameras]
+            [
+                KeypointEncoder(config.channels, config.keypoints, config.stride)
+                for _ in self.cameras
+            ]
         )
         self.reader = None
         if config.reads_text:
@@ -334,17 +340,20 @@ class KeypointEncoder(nn.Module):
     5 pixels was not found in 1,100 steps; now 300 suffice.
 
     Args:
-        channels: Number in each layer; the first two layers halve the picture's sides.
+        channels: Number in each layer; the first two layers reduce the picture's sides.
         keypoints: Number of keypoints K.
+        stride: Of the first layer [pixels].
     """
 
-    def __init__(self, channels: Sequence[int], keypoints: int) -> None:
+    def __init__(self, channels: Sequence[int], keypoints: int, stride: int = 2) -> None:
         super().__init__()
         layers: list[nn.Module] = []
-        for i, (inputs, outputs) in enumerate(zip((3, *channels[:-1]), channels, strict=True)):
-            kernel = 5 if i == 0 else 3
+        strides = (stride, 2, *[1] * (len(channels) - 2))
+        sides = zip((3, *channels[:-1]), channels, strides, strict=True)
+        for i, (inputs, outputs, step) in enumerate(sides):
+            kernel = 3 if i else 2 * stride + 1
             layers += [
-                nn.Conv2d(inputs, outputs, kernel, stride=2 if i < 2 else 1, padding=kernel // 2),
+                nn.Conv2d(inputs, outputs, kernel, stride=step, padding=kernel // 2),
                 nn.ReLU(),
             ]
         self.layers = nn.Sequential(*layers)

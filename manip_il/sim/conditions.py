@@ -158,13 +158,16 @@ class Condition:
         kept = {one: ranges[one] for one in RANGES if one in ranges}
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
-    def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
+    def for_world(
+        self, *, has_object: bool, sees: bool, sizes: Range | None, named: bool = False
+    ) -> Condition | None:
         """Return the condition without the ranges that have no effect.
 
         Args:
             has_object: Whether the task has an object.
             sees: Whether the policy has cameras.
             sizes: Object sizes that the task can take [m]; None: only its own.
+            named: Whether the task's texts tell objects by their colours, which then stay.
 
         Returns:
             The condition; None if it had ranges and none of them is left.
@@ -178,6 +181,7 @@ class Condition:
             if (has_object or not RANGES[name].of_object)
             and (sees or RANGES[name].changes not in ("look", "pictures"))
             and (sizes or name != "size")
+            and not (named and name == "colour")
         }
         if "size" in kept and sizes is not None:
             (least, most), asked = sizes, kept["size"]

@@ -16,6 +16,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.data.schema import EXPERT_PHASE
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
+from manip_il.sim.conditions import Condition
 from manip_il.sim.events import STANDARD
 from manip_il.sim.scene import Scene
 from manip_il.sim.task import NO_PHASE, phases
@@ -25,7 +26,7 @@ from manip_il.tasks.objects import UPRIGHT
 from manip_il.tasks.table import TASKS
 from manip_il.worlds.ladder import world
 from manip_il.worlds.ladder.world import make_env, scene_of
-from manip_il.worlds.table import env_fingerprint, env_spec, make_config
+from manip_il.worlds.table import env_fingerprint, env_spec, make_config, world_of
 
 from ..scenes import has_goal, sizes_of, started, still
 from ..tables import SCENES, WITH_A_CUBE, every_scene, every_task
@@ -59,6 +60,15 @@ def test_phases_are_none_and_then_the_rungs_from_the_first_on(task: str):
     assert names[0] == NO_PHASE
     assert len(set(names)) == len(names)
     assert list(names[:0:-1]) == [rung.name for rung in TASKS[task].rungs]
+
+
+@every_task
+def test_colours_that_texts_name_are_not_drawn(task: str):
+    paint = Condition("paint", colour=(0.1, 0.9))
+    kept = world_of("panda", task).affecting(make_config("panda", task), paint, sees=True)
+    nouns = [TASKS[task].noun(name) for name in TASKS[task].objects]
+    named = any({"red", "blue", "yellow"} & set(noun.split()) for noun in nouns)
+    assert (kept is not None) == (bool(nouns) and not named)
 
 
 @every_scene

@@ -18,10 +18,11 @@ from manip_il.sim.view import simplify_meshes
 from manip_il.worlds.gym.restoring import model_arrays, simulation
 from manip_il.worlds.gym.world import GymWorld
 
-VERSION = 1  # changes when pictures do
+VERSION = 2  # changes when pictures do
 RENDER = ("render",)  # the camera of an environment that draws itself
 _CELL = 0.004  # least cell size of simplified meshes [m]
 _FINER = 2  # supersampling each way, in place of OpenGL's antialiasing, which draws all again
+_SHADOWS = 512  # most texels of a shadow map's side; 4096, the default, take three times as long
 # what of a model may differ between episodes and be seen
 _SEEN = ("body_", "geom_", "site_", "cam_", "light_", "mat_rgba", "tendon_")
 
@@ -44,7 +45,7 @@ def draw(world: GymWorld, env: Any, camera: str, cameras: CameraConfig) -> NDArr
         world: The world.
         env: Its environment.
         camera: Name of the camera.
-        cameras: Size and look of the picture; of the look, shadows alone.
+        cameras: Size of the picture; lamps and shadows are the model's.
 
     Raises:
         RenderError: if there is no off-screen OpenGL.
@@ -82,7 +83,7 @@ def painted(
         task: Its task.
         simulated: Model and data of the environment.
         camera: Name of the camera in the model.
-        cameras: Size and look of the picture; of the look, shadows alone.
+        cameras: Size of the picture; lamps and shadows are the model's.
     """
     painter = _painter(cls, task, cameras)
     return painter.picture(*simulated, camera)
@@ -93,8 +94,7 @@ class _Painter:
         self._model: Any = copy.copy(model)
         simplify_meshes(self._model, _CELL)
         self._model.vis.quality.offsamples = 0
-        if not cameras.look.shadows:
-            self._model.vis.quality.shadowsize = 0
+        self._model.vis.quality.shadowsize = min(self._model.vis.quality.shadowsize, _SHADOWS)
         height, width = (_FINER * side for side in cameras.size)
         whole = self._model.vis.global_
         whole.offwidth = max(whole.offwidth, width)

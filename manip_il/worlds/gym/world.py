@@ -116,7 +116,7 @@ class GymWorld:
         Args:
             env: The environment.
             camera: One of its cameras.
-            cameras: Size, and whether there are shadows.
+            cameras: Size of the picture.
 
         Returns:
             The picture, (height, width, 3); None for the one of the model's camera, or of the

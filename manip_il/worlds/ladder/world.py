@@ -431,7 +431,12 @@ class LadderKind(WorldKind):
             UsageError: if the task can take none of the condition's object sizes.
         """
         task = get_task(config.task, config.object)
-        return condition.for_world(has_object=bool(task.objects), sees=sees, sizes=task.sizes)
+        return condition.for_world(
+            has_object=bool(task.objects),
+            sees=sees,
+            sizes=task.sizes,
+            named=not task.nouns.keys().isdisjoint(task.objects),
+        )
 
 
 WORLD = LadderKind()
