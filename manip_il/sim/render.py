@@ -9,8 +9,8 @@ from __future__ import annotations
 import atexit
 import math
 import os
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 from importlib import import_module
 from itertools import product
 from typing import Any, NamedTuple
@@ -167,7 +167,7 @@ PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1"
 # if no picture can be rendered
 REMEDY = f"unset MUJOCO_GL if it is set; on Debian: apt-get install -y {PACKAGES}"
 _FINER = 2  # supersampling each way: cheaper than OpenGL's antialiasing, which redraws the meshes
-_MAX_GEOMS = 1_000
+_MAX_GEOMS = 10_000
 _EE = 4  # group of the site `ee`, the robot's only one
 _AXES = 0.06, 0.006  # length and thickness of the axes drawn at `ee` [m]
 
@@ -234,17 +234,24 @@ def close() -> None:
         _context.own.cache_clear()
 
 
-def _renderer(scene: Scene, look: Look) -> _Renderer:
-    """The renderer that was used last, or a new one in its place, in this thread's OpenGL
-    context.
+def in_context[T](prepare: Callable[[], T]) -> T:
+    """Make this thread's OpenGL context current, and return what `prepare` makes in it.
+
+    Raises:
+        RenderError: If there is no off-screen OpenGL.
     """
     try:
         _context().make_current()
-        return _prepared(scene, look)
+        return prepare()
     except Exception as error:  # mujoco raises many kinds of errors, from ImportError to its own
         raise RenderError(
             f"no off-screen OpenGL ({type(error).__name__}: {error}); {REMEDY}"
         ) from error
+
+
+def _renderer(scene: Scene, look: Look) -> _Renderer:
+    """The renderer that was used last, or a new one in its place."""
+    return in_context(partial(_prepared, scene, look))
 
 
 @cached_per_thread()
@@ -267,47 +274,56 @@ def _prepared(scene: Scene, look: Look) -> _Renderer:
     return _Renderer(scene, look)
 
 
-class _Renderer:
-    """Draws one scene in one look, in pictures of any size. Needs a current OpenGL context."""
+class Canvas:
+    """Draws one model, in pictures of any size. Needs a current OpenGL context.
 
-    def __init__(self, scene: Scene, look: Look):
-        self._view = ViewModel(scene, look)
-        self._model = self._view.model
-        self._data, self._props = mujoco.MjData(self._model), list[Prop]()
-        scale = self._model.vis.scale
-        scale.framelength, scale.framewidth = np.array(_AXES) / self._model.stat.meansize
-        self._of = scene
-        self._scene: Any = mujoco.MjvScene(self._model, _MAX_GEOMS)
+    Args:
+        model: The model to draw, in which its lamps and the size of its shadow map are set.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        self.model: Any = model
+        self.data: Any = mujoco.MjData(model)
+        self._scene: Any = mujoco.MjvScene(model, _MAX_GEOMS)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._cameras = {name: camera_id(self._model, name) for name in CAMERAS}
-        self._context: Any = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        self._context: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         if self._context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN:
             raise RuntimeError("the context has no off-screen buffers")
 
-    def pose(self, data: mujoco.MjData, variation: F64) -> None:
-        """Take the poses from `data`, and apply the look of a variation (v,)."""
-        self._view.apply(variation)
-        self._data.qpos[:] = data.qpos
-        self._data.mocap_pos[:], self._data.mocap_quat[:] = data.mocap_pos, data.mocap_quat
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_camlight(self._model, self._data)
-        self._props = props(self._of, self._data, part(variation, "clutter"))
+    def pose(self, data: mujoco.MjData) -> None:
+        """Take the poses from `data`."""
+        self.data.qpos[:] = data.qpos
+        self.data.mocap_pos[:], self.data.mocap_quat[:] = data.mocap_pos, data.mocap_quat
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        mujoco.mj_tendon(self.model, self.data)
 
-    def picture(self, camera: str, size: tuple[int, int], *, axes: bool) -> Picture:
+    def picture(
+        self, camera: int, size: tuple[int, int], props: Sequence[Prop] = (), *, axes: bool = False
+    ) -> Picture:
+        """Return a picture, (height, width, 3).
+
+        Args:
+            camera: Number of the camera in the model.
+            size: Height and width [pixels].
+            props: Objects that are not in the model.
+            axes: Whether to draw the axes of the site `ee`.
+        """
         height, width = (_FINER * side for side in size)
         most_wide, most_high = self._context.offWidth, self._context.offHeight
         if height > most_high or width > most_wide:  # pictures of all sizes share one buffer
             mujoco.mjr_resizeOffscreen(max(width, most_wide), max(height, most_high), self._context)
-        self._camera.fixedcamid = self._cameras[camera]
+        self._camera.fixedcamid = camera
         self._option.sitegroup[_EE] = axes
         frame, everything = mujoco.mjtFrame, mujoco.mjtCatBit.mjCAT_ALL
         self._option.frame = frame.mjFRAME_SITE if axes else frame.mjFRAME_NONE
         mujoco.mjv_updateScene(
-            self._model, self._data, self._option, None, self._camera, everything, self._scene
+            self.model, self.data, self._option, None, self._camera, everything, self._scene
         )
-        for prop in self._props:
+        for prop in props:
             prop.add_to(self._scene)
         fine = np.empty((height, width, 3), dtype=np.uint8)
         view = mujoco.MjrRect(0, 0, width, height)
@@ -316,18 +332,41 @@ class _Renderer:
         # OpenGL counts rows from below
         return np.asarray(Image.fromarray(fine).reduce(_FINER))[::-1].copy()
 
-    def project(self, camera: str, points: F64, aspect: float) -> F32:
-        number = self._cameras[camera]
+    def project(self, camera: int, points: F64, aspect: float) -> F32:
+        """Return where points (K, 3) [m] are in a camera's pictures, (K, 3), as `projections`."""
         x, y, back = (
-            self._data.cam_xmat[number].reshape(3, 3).T @ (points - self._data.cam_xpos[number]).T
+            self.data.cam_xmat[camera].reshape(3, 3).T @ (points - self.data.cam_xpos[camera]).T
         )
         ahead = np.where(back < 0, -back, np.inf)
-        half = ahead * math.tan(math.radians(self._model.cam_fovy[number]) / 2)
+        half = ahead * math.tan(math.radians(self.model.cam_fovy[camera]) / 2)
         found = np.stack(
             [0.5 + x / (2 * half * aspect), 0.5 - y / (2 * half), np.ones_like(x)], axis=1
         )
         inside = ((found[:, :2] >= 0) & (found[:, :2] <= 1)).all(axis=1) & np.isfinite(ahead)
         return np.where(inside[:, None], found, 0.0).astype(np.float32)
+
+
+class _Renderer:
+    """Draws one scene in one look, with the objects without contact."""
+
+    def __init__(self, scene: Scene, look: Look):
+        self._of, self._view = scene, ViewModel(scene, look)
+        scale = self._view.model.vis.scale
+        scale.framelength, scale.framewidth = np.array(_AXES) / self._view.model.stat.meansize
+        self._canvas, self._props = Canvas(self._view.model), list[Prop]()
+        self._cameras = {name: camera_id(self._view.model, name) for name in CAMERAS}
+
+    def pose(self, data: mujoco.MjData, variation: F64) -> None:
+        """Take the poses from `data`, and apply the look of a variation (v,)."""
+        self._view.apply(variation)
+        self._canvas.pose(data)
+        self._props = props(self._of, self._canvas.data, part(variation, "clutter"))
+
+    def picture(self, camera: str, size: tuple[int, int], *, axes: bool) -> Picture:
+        return self._canvas.picture(self._cameras[camera], size, self._props, axes=axes)
+
+    def project(self, camera: str, points: F64, aspect: float) -> F32:
+        return self._canvas.project(self._cameras[camera], points, aspect)
 
 
 _SIGNS = np.array(list(product((-1, 1), repeat=3)))  # signs of a box's corners

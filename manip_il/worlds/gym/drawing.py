@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from manip_il.caching import cached_per_thread
-from manip_il.errors import RenderError, UsageError
+from manip_il.errors import UsageError
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.render import REMEDY
+from manip_il.sim.render import Canvas, in_context
 from manip_il.sim.view import simplify_meshes
 from manip_il.worlds.gym.restoring import model_arrays, simulation
 from manip_il.worlds.gym.world import GymWorld
@@ -21,7 +22,6 @@ from manip_il.worlds.gym.world import GymWorld
 VERSION = 2  # changes when pictures do
 RENDER = ("render",)  # the camera of an environment that draws itself
 _CELL = 0.004  # least cell size of simplified meshes [m]
-_FINER = 2  # supersampling each way, in place of OpenGL's antialiasing, which draws all again
 _SHADOWS = 512  # most texels of a shadow map's side; 4096, the default, take three times as long
 # what of a model may differ between episodes and be seen
 _SEEN = ("body_", "geom_", "site_", "cam_", "light_", "mat_rgba", "tendon_")
@@ -85,45 +85,34 @@ def painted(
         camera: Name of the camera in the model.
         cameras: Size of the picture; lamps and shadows are the model's.
     """
-    painter = _painter(cls, task, cameras)
-    return painter.picture(*simulated, camera)
+    painter = in_context(partial(_painter, cls, task))
+    return painter.picture(*simulated, camera, cameras.size)
 
 
 class _Painter:
-    def __init__(self, model: mujoco.MjModel, cameras: CameraConfig):
-        self._model: Any = copy.copy(model)
-        simplify_meshes(self._model, _CELL)
-        self._model.vis.quality.offsamples = 0
-        self._model.vis.quality.shadowsize = min(self._model.vis.quality.shadowsize, _SHADOWS)
-        height, width = (_FINER * side for side in cameras.size)
-        whole = self._model.vis.global_
-        whole.offwidth = max(whole.offwidth, width)
-        whole.offheight = max(whole.offheight, height)
-        self._data = mujoco.MjData(self._model)
+    def __init__(self, model: mujoco.MjModel):
+        drawn: Any = copy.copy(model)
+        simplify_meshes(drawn, _CELL)
+        quality = drawn.vis.quality
+        quality.offsamples = 0  # the canvas smooths edges itself
+        quality.shadowsize = min(quality.shadowsize, _SHADOWS)
+        self._canvas = Canvas(drawn)
         self._arrays = [name for name in model_arrays(model) if name.startswith(_SEEN)]
-        try:
-            self._renderer = mujoco.Renderer(self._model, height, width)
-        except Exception as error:  # what OpenGL and its bindings raise
-            raise RenderError(f"no off-screen OpenGL ({error}); {REMEDY}") from error
 
-    def picture(self, model: Any, data: Any, camera: str) -> NDArray[np.uint8]:
+    def picture(
+        self, model: Any, data: Any, camera: str, size: tuple[int, int]
+    ) -> NDArray[np.uint8]:
         for name in self._arrays:
-            getattr(self._model, name)[:] = getattr(model, name)
-        self._data.qpos[:] = data.qpos
-        self._data.mocap_pos[:], self._data.mocap_quat[:] = data.mocap_pos, data.mocap_quat
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)
-        mujoco.mj_camlight(self._model, self._data)
-        mujoco.mj_tendon(self._model, self._data)
-        self._renderer.update_scene(self._data, camera)
-        return np.asarray(Image.fromarray(self._renderer.render()).reduce(_FINER))
+            getattr(self._canvas.model, name)[:] = getattr(model, name)
+        self._canvas.pose(data)
+        return self._canvas.picture(model.camera(camera).id, size)
 
 
 @cached_per_thread(4)
-def _painter(cls: type[GymWorld], task: str, cameras: CameraConfig) -> _Painter:
+def _painter(cls: type[GymWorld], task: str) -> _Painter:
     """What draws a world's states in this thread, for any number of its environments."""
     env = cls(task).make()
     env.reset(seed=0)
     model, _ = simulation(env) or (None, None)
     assert model is not None  # `draw` has seen it
-    return _Painter(model, cameras)
+    return _Painter(model)
