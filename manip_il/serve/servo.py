@@ -1,5 +1,5 @@
-"""How an STS3215 moves a joint: a position loop with gain, torque and speed limits, gear play
-and delay.
+"""How an STS3215 moves a joint: a goal that is late and moves at most at a given speed, gear play,
+and a position loop with gain, torque limit, damping and friction.
 """
 
 import math
@@ -9,10 +9,9 @@ import numpy as np
 
 from manip_il.mdp import F64
 from manip_il.serve.bus import STEP, Bus
-from manip_il.serve.config import ServoConfig
+from manip_il.serve.config import FACTORY_GAIN, ServoConfig
 from manip_il.sim.world import World
 
-_FACTORY_GAIN = 32  # P_Coefficient of a new servo, at which `stiffness` is specified
 _HAND = 100.0  # stiffness of a hand that holds an arm whose torque is off [N m/rad]
 
 
@@ -42,7 +41,7 @@ class Follower:
         self._dof = model.jnt_dofadr[
             [int(np.flatnonzero(model.jnt_qposadr == q)[0]) for q in self.q]
         ]
-        self._at = np.zeros(len(self.q))
+        self._at = self._ramp = np.zeros(len(self.q))
         self._on = np.zeros(len(self.q), bool)
         self._coming = deque[F64]()
 
@@ -51,9 +50,10 @@ class Follower:
         self.config = config
         for model in (self._world.scene.model, self._world.model):
             model.body_gravcomp[:] = 0.0
-            model.dof_damping[self._dof] = config.torque / config.speed  # the motor's back EMF
+            model.dof_damping[self._dof] = 0.0  # the servo's own is part of its torque
             model.dof_frictionloss[self._dof] = config.friction
-        self._at = self._world.data.qpos[self.q]
+            model.dof_armature[self._dof] = config.armature
+        self._at = self._ramp = self._world.data.qpos[self.q]
         self._coming = deque([self._at] * round(config.delay / self._step))
         self._bus.show(self._at + self.offset, settled=True)
 
@@ -64,7 +64,7 @@ class Follower:
 
     def _gain(self) -> F64:
         """Return the stiffness of every servo at its current gain [N m/rad], (n,)."""
-        return self.config.stiffness * np.maximum(1, self._bus["P_Coefficient"]) / _FACTORY_GAIN
+        return self.config.stiffness * np.maximum(1, self._bus["P_Coefficient"]) / FACTORY_GAIN
 
     def sag(self) -> F64:
         """Return how far the joints are from their goals at rest under gravity [rad], (n,)."""
@@ -90,15 +90,19 @@ class Follower:
             limit = np.minimum(bus["Max_Torque_Limit"], bus["Torque_Limit"]) / 1000
         self._coming.append(goal)
         goal = self._coming.popleft()
+        most = self.config.speed * self._step
+        ramp = self._ramp + np.clip(goal - self._ramp, -most, most)
         play = math.radians(self.config.play) / 2
-        led = np.clip(self._at, goal - play, goal + play)
+        led = np.clip(self._at, ramp - play, ramp + play)
         # torque off: stay where it was turned off
         self._at = np.where(on, led, np.where(self._on, q, self._at))
+        self._ramp = np.where(on, ramp, self._at)
         self._on = on
         data.ctrl[self._ctrl] = np.where(on & (np.abs(self._at - q) < dead), q, self._at)
         gain = np.where(on, gain, _HAND)
         model.actuator_gainprm[self._ctrl, 0] = gain
-        model.actuator_biasprm[self._ctrl, 1:3] = np.stack([-gain, np.zeros(len(gain))], axis=1)
+        damping = np.full(len(gain), self.config.damping)
+        model.actuator_biasprm[self._ctrl, 1:3] = -np.stack([gain, damping], axis=1)
         most = self.config.torque * np.where(on, limit, 1.0)
         model.actuator_forcerange[self._ctrl] = np.stack([-most, most], axis=1)
 

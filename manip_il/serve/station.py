@@ -27,6 +27,7 @@ from manip_il.sim.world import World
 from manip_il.worlds.ladder.expert import LadderExpert
 
 FEETECH = "so_follower"  # LeRobot's `robot_type` of arms with these servos
+TICK = 4  # physics steps between moments at which clients read and write: 8 ms at 480 Hz
 HELD = 1.0  # how long the task must stay solved before it counts [s]
 _FULL_TURN = "wrist_roll"  # the joint whose range is a full turn in LeRobot's calibration
 
@@ -59,7 +60,7 @@ class Station:
     Attributes:
         env: The simulated environment.
         seed: Seed of the current world.
-        clock: Paces the control steps.
+        clock: Paces the moments at which clients read and write.
         limits: The servos' joint limits [rad], (n, 2).
         buses: The servos of `follower` and of `leader`.
         follower: The follower's servos as motors of the simulated arm.
@@ -92,12 +93,13 @@ class Station:
         self._servos = replace(config.servos, **IDEAL) if config.servo == "ideal" else config.servos
         self._expert = LadderExpert(env.scene)
         self._step = 1 / env.config.control_hz  # [s]
-        self.clock = Clock(env.config.control_hz * config.speed)
+        moments = env.config.control_hz * env.config.physics_steps / TICK  # a second
+        self.clock, self._ticks = Clock(moments * config.speed), 0
         ranges = env.scene.model.jnt_range[np.isin(env.scene.model.jnt_qposadr, env.scene.arm_q)]
         # the servos' joint limits [rad], (n, 2)
         self.limits: F64 = np.array([*ranges, sorted(robot.lerobot.gripper)])
         self.buses = {name: self._open(name) for name in ("follower", "leader")}
-        self.follower = Follower(env.world, self.buses["follower"], self._step)
+        self.follower = Follower(env.world, self.buses["follower"], env.config.physics_step)
         self.mover: Mover = lambda: None
         self.hand: F64 | None = None
         self.on_read: Callable[[Read], None] = lambda read: None
@@ -163,10 +165,7 @@ class Station:
 
     def run(self, each_step: Callable[[], bool]) -> None:
         """Run the simulation until `each_step`, called every control step, returns False."""
-        while True:
-            self.clock.wait()
-            if not each_step():
-                return
+        while each_step():
             self._advance()
 
     def _advance(self) -> None:
@@ -177,12 +176,20 @@ class Station:
             env.data.qvel[:] = 0.0
             mujoco.mj_forward(env.world.model, env.data)
             self._place_leader(self.hand)
+            for _ in range(env.config.physics_steps):
+                self._tick()
         else:
             self._move_leader(self.mover())
-            self.follower.command()
-            env.simulate()
+            env.simulate(self._tick)
             self._solved = self._solved + 1 if env.solved else 0
-        self._show()
+
+    def _tick(self) -> None:
+        """Command the motors for a physics step, once it is time for it."""
+        if self._ticks % TICK == 0:
+            self._show()
+            self.clock.wait()
+        self._ticks += 1
+        self.follower.command()
 
     def _place_leader(self, q: F64) -> None:
         self._leader = q.copy()

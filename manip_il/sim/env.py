@@ -3,7 +3,7 @@ conditions.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -232,13 +232,20 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.simulate()
         return executed
 
-    def simulate(self) -> None:
+    def simulate(self, before: Callable[[], None] | None = None) -> None:
         """Run one control step with the actuators' commands as they are.
 
         `advance` calls this once it has set them.
+
+        Args:
+            before: Called before every physics step, to change the commands.
         """
         self._begin_step()
-        mujoco.mj_step(self.world.model, self.data, self.config.physics_steps)
+        pieces = self.config.physics_steps if before else 1
+        for _ in range(pieces):
+            if before:
+                before()
+            mujoco.mj_step(self.world.model, self.data, self.config.physics_steps // pieces)
         self.world.update()  # otherwise poses are those at the start of the last physics step
         self._step += 1
         self._begun = False

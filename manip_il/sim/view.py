@@ -250,20 +250,23 @@ def require_display() -> None:
         raise RenderError(f"no display: {named}; write a file: manip-il view --output=FILE.rrd")
 
 
+_CATCH_UP = 0.03  # most time that a clock makes up for [s]
+
+
 class Clock:
-    """Paces control steps in real time."""
+    """Paces steps in real time."""
 
     def __init__(self, hz: float):
         self._step, self._due = 1 / hz, 0.0
 
     def wait(self) -> None:
-        """Wait until a control step has passed since the last call returned.
+        """Wait until a step has passed since the last one was due.
 
-        Return at once if it already has.
+        Return at once if it already has; steps that were a little late are made up for.
         """
         now = time.monotonic()
-        self._due = max(self._due + self._step, now)
-        time.sleep(self._due - now)
+        self._due = max(self._due + self._step, now - _CATCH_UP)
+        time.sleep(max(0.0, self._due - now))
 
 
 class Window:

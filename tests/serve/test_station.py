@@ -16,7 +16,7 @@ from lerobot.teleoperators.so_leader import SO101Leader, SOLeaderTeleopConfig
 
 from manip_il.cli.main import main
 from manip_il.errors import UsageError
-from manip_il.serve.config import ServoConfig, SessionConfig
+from manip_il.serve.config import VARIED, ServoConfig, SessionConfig
 from manip_il.serve.station import Station
 from manip_il.worlds.ladder.world import env_of
 from manip_il.worlds.table import make_config
@@ -100,7 +100,11 @@ def test_a_lower_gain_sags_more(station: Station):
 def test_servos_that_vary_differ_within_their_ranges():
     drawn = [ServoConfig().varied(np.random.default_rng(seed)) for seed in range(50)]
     assert len({one.stiffness for one in drawn}) == 50
-    assert all(0.7 * 27 <= one.stiffness <= 1.3 * 27 and 0 <= one.delay <= 0.035 for one in drawn)
+    for name, (low, high) in VARIED.items():
+        own, values = getattr(ServoConfig(), name), [getattr(one, name) for one in drawn]
+        added = name in ("delay", "offset")
+        low, high = (own + low, own + high) if added else (own * low, own * high)
+        assert low <= min(values) < max(values) <= high
 
 
 def test_the_expert_at_the_leader_solves_the_task_through_the_servos(station: Station):
