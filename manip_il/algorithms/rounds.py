@@ -31,6 +31,7 @@ from manip_il.learn.train import Trainer
 from manip_il.learn.training_state import PRETRAINED_MODEL
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_base
+from manip_il.worlds.table import env_spec
 
 _LOG = logging.getLogger(__name__)
 CHUNK_STEPS = 20_000  # default gradient steps per round for LeRobot's policies
@@ -201,13 +202,18 @@ def round_scenes(config: RunConfig, datasets: Sequence[Path]) -> Scenes:
     """Return the scenes to redraw from the states of the last dataset.
 
     There are as many scenes per state as in round 0. Scene numbers continue from the earlier
-    rounds.
+    rounds. Where nothing can be drawn anew, they are the states as visited.
     """
     assert config.cameras is not None
     states = [len(Dataset.open(dataset)) for dataset in datasets]
     *before, frames = [max(1, config.redraw * count // states[0]) for count in states]
     return Scenes(
-        config.cameras, frames, config.seed, conditions=config.conditions, first=sum(before)
+        config.cameras,
+        frames,
+        config.seed,
+        anew="redrawn" in env_spec(config.env).can,
+        conditions=config.conditions,
+        first=sum(before),
     )
 
 
