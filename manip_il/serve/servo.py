@@ -12,6 +12,7 @@ from manip_il.serve.bus import STEP, Bus
 from manip_il.serve.config import FACTORY_GAIN, ServoConfig
 from manip_il.sim.world import World
 
+_DRY = 0.999, 0.9999  # of MuJoCo's friction, which lets joints creep at its default
 _HAND = 100.0  # stiffness of a hand that holds an arm whose torque is off [N m/rad]
 
 
@@ -52,6 +53,7 @@ class Follower:
             model.body_gravcomp[:] = 0.0
             model.dof_damping[self._dof] = 0.0  # the servo's own is part of its torque
             model.dof_frictionloss[self._dof] = config.friction
+            model.dof_solimp[self._dof, :2] = _DRY
             model.dof_armature[self._dof] = config.armature
         self._at = self._ramp = self._world.data.qpos[self.q]
         self._coming = deque([self._at] * round(config.delay / self._step))
