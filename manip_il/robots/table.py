@@ -59,11 +59,6 @@ def get_robot(name: NameOrPath) -> Robot:
     raise UnknownName("robot", name, (*ROBOTS, "the path of a YAML or of a world's Python file"))
 
 
-def is_robot(name: str) -> bool:
-    """Return whether a robot of this name ships or an installed package provides it."""
-    return name in ROBOTS or bool(entry_points(group=GROUP, name=name))
-
-
 def read_robot(path: Path) -> Robot:
     """Read a robot's YAML.
 

@@ -334,18 +334,6 @@ class WorldKind:
         """Return a number that changes when pictures do."""
         raise NotImplementedError
 
-    def own_files(self, spec: Any, shape: str) -> list[str]:
-        """Return the options that commands need for what is not built in.
-
-        Args:
-            spec: The `EnvironmentSpec` of a dataset or the `Origin` of a policy.
-            shape: The object, as a dataset stores it; empty for the task's default.
-
-        Returns:
-            Options with FILE for a path; [] if everything is built in.
-        """
-        return []
-
     def lerobot_words(self, robot: str, task: str) -> list[str]:
         """Return the options of `lerobot-eval` for this environment; [] if it cannot run there."""
         return []

@@ -339,11 +339,6 @@ class SeveralTasks(WorldKind):
         return max(self._kind.drawing_version(part) for part in self._parts(config))
 
     @override
-    def own_files(self, spec: Any, shape: str) -> list[str]:
-        found = [self._kind.own_files(replace(spec, task=name), shape) for name in self.names]
-        return list(dict.fromkeys(option for options in found for option in options))
-
-    @override
     def lerobot_words(self, robot: str, task: str) -> list[str]:
         return self._kind.lerobot_words(robot, task)
 

@@ -373,11 +373,6 @@ class GymKind(WorldKind):
         return DRAWN
 
     @override
-    def own_files(self, spec: Any, shape: str) -> list[str]:
-        tasks = self._cls.tasks
-        return [f"--task.type={'|'.join(tasks)}"] if tasks and spec.task not in tasks else []
-
-    @override
     def fingerprint(self, config: EnvConfig) -> dict[str, str]:
         settings, env = asdict(config), self.environment(config, None, ())
         del settings["object"]  # there is none

@@ -25,7 +25,7 @@ from manip_il.own_file import source_hash
 from manip_il.robots import ROBOTS
 from manip_il.robots.robot import ModelFiles, Robot
 from manip_il.robots.spec import model_bytes
-from manip_il.robots.table import get_robot, is_robot
+from manip_il.robots.table import get_robot
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv, environment_state_names
@@ -33,16 +33,15 @@ from manip_il.sim.mesh import mesh_path
 from manip_il.sim.render import LOOK_VERSION as DRAWN
 from manip_il.sim.render import point_names
 from manip_il.sim.scene import Scene, build_scene
-from manip_il.sim.shape import MESH, ObjectShape, stored
+from manip_il.sim.shape import ObjectShape, stored
 from manip_il.sim.task import Task, phases
 from manip_il.sim.variation import part, with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks import ENV_IDS
-from manip_il.tasks.table import TASKS, get_task, is_task
+from manip_il.tasks.table import TASKS, get_task
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.contract import (
     OPENINGS,
-    OWN_ACTIONS,
     SERVOS,
     Environment,
     EnvironmentSpec,
@@ -325,7 +324,8 @@ class LadderKind(WorldKind):
 
         Fill in rate and task.
         """
-        task, robot = get_task(config.task), get_robot(config.robot)
+        robot = get_robot(config.robot)
+        task = get_task(config.task)
         for file in (config.task, config.robot, mesh_path(config.object)):
             if isinstance(file, Path):
                 check_unchanged(file)
@@ -392,14 +392,6 @@ class LadderKind(WorldKind):
     @override
     def drawing_version(self, config: EnvConfig) -> int:
         return DRAWN + (str(config.task).partition(":")[0] in _TURNED)
-
-    @override
-    def own_files(self, spec: Any, shape: str) -> list[str]:
-        if spec.action_meaning == OWN_ACTIONS:
-            return ["--env.type=FILE.py"]
-        robots = [] if is_robot(spec.robot) else ["--robot.type=FILE.yaml"]
-        meshes = ["--task.object=mesh:FILE:LENGTH"] if shape.startswith(MESH) else []
-        return [*robots, *([] if is_task(spec.task) else ["--task.type=FILE.py"]), *meshes]
 
     @override
     def lerobot_words(self, robot: str, task: str) -> list[str]:
