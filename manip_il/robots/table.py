@@ -17,10 +17,6 @@ from manip_il.robots.robot import (
     FOUND,
     GRIPPER,
     KEYS,
-    SOFT,
-    UPRIGHT,
-    YAWS,
-    Costs,
     GripperConfig,
     ModelFiles,
     Robot,
@@ -29,7 +25,6 @@ from manip_il.robots.robot import (
 from manip_il.robots.spec import arm_joints
 
 SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
-_UPRIGHT_JOINTS = 6  # with fewer joints, a hand cannot point down everywhere
 GROUP = "manip_il.robots"  # entry points: a robot's name, and the path of its YAML
 
 
@@ -88,9 +83,7 @@ def read_robot(path: Path) -> Robot:
 
 
 def _said(path: Path, tree: Any) -> dict[str, Any]:
-    """The fields that a YAML gives, the arm's joints, and the defaults that depend on their
-    number.
-    """
+    """The fields that a YAML gives, and the arm's joints."""
     tree, kinds = dict(checks.mapping(str(path), tree)), typing.get_type_hints(Robot)
     known = (*KEYS, *(name for name in kinds if name not in ("name", "files")))
     for key in tree:
@@ -106,7 +99,6 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
         "files": ModelFiles.read("", tree, path.parent),
         "gripper": _gripper(checks.mapping("gripper", tree["gripper"]), path.parent),
     }
-    costs = checks.mapping("costs", tree.pop("costs", {}))
     for camera in checks.mapping("cameras", tree.get("cameras", {})):
         if camera not in SCENE_CAMERAS:
             raise UnknownName("camera in a robot's YAML:", camera, SCENE_CAMERAS)
@@ -117,12 +109,6 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
     }
     if "joints" not in said:
         said["joints"] = arm_joints(said["name"], said["files"], said["hand"], said["gripper"])
-    upright = len(said["joints"]) >= _UPRIGHT_JOINTS
-    said.setdefault("yaw", YAWS[not upright])
-    # such an arm leans, however much its orientation costs
-    if not upright and "orientation" in costs:
-        costs = {"leaning": costs["orientation"]} | costs
-    said["costs"] = read("costs", Costs, vars(UPRIGHT if upright else SOFT) | costs)
     return said
 
 
