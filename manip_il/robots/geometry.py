@@ -181,11 +181,7 @@ def yaw_ahead(robot: Robot, shoulder: F64, position: F64) -> float:
         shoulder: Position of the arm's first joint, (3,) [m].
         position: Position of the hand, (3,) [m].
     """
-    return (
-        math.atan2(position[1] - shoulder[1], position[0] - shoulder[0])
-        if robot.leans
-        else 0.0
-    )
+    return math.atan2(position[1] - shoulder[1], position[0] - shoulder[0]) if robot.leans else 0.0
 
 
 def angle_ahead(rotation: F64) -> float:

@@ -4,7 +4,6 @@ import typing
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +24,13 @@ from manip_il.robots.robot import (
 from manip_il.robots.spec import arm_joints
 
 SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
-GROUP = "manip_il.robots"  # entry points: a robot's name, and the path of its YAML
 
 
 def get_robot(name: NameOrPath) -> Robot:
     """Return a robot.
 
     Args:
-        name: Its name, its entry point, or the `Path` of a YAML that the user gave.
+        name: Its name, or the `Path` of a YAML that the user gave.
 
     Raises:
         UnknownName: If there is no robot of this name.
@@ -42,15 +40,6 @@ def get_robot(name: NameOrPath) -> Robot:
         return _read(name.absolute())
     if name in ROBOTS:
         return _read(ROBOTS[name])
-    for found in entry_points(group=GROUP, name=name):
-        try:
-            path = Path(found.load())
-        except Exception as error:
-            why = checks.one_line(error)
-            raise UsageError(
-                f"robot {name} of {found.value}: {why}; expected the path of a YAML"
-            ) from error
-        return _read(path.absolute())
     raise UnknownName("robot", name, (*ROBOTS, "the path of a YAML or of a world's Python file"))
 
 

@@ -19,7 +19,6 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.errors import UnknownName, UsageError
 from manip_il.robots import ROBOTS
-from manip_il.robots import table as robots
 from manip_il.sim.render import point_names
 from manip_il.tasks import table
 from manip_il.tasks.table import get_task
@@ -263,22 +262,3 @@ def test_a_package_brings_names(touch, monkeypatch):
         get_task("tuch")
     with pytest.raises(UsageError, match="does not exist"):
         get_task(Path("tuch.py"))
-
-
-def test_a_package_brings_robots_or_is_refused_in_one_line(monkeypatch):
-    class Entry:
-        def __init__(self, place: object):
-            self.value, self._place = "my_lab.robots:ARM", place
-
-        def load(self) -> object:
-            return self._place
-
-    brought = {"my_arm": Entry(ROBOTS["panda"]), "broken": Entry(3)}
-    monkeypatch.setattr(
-        robots, "entry_points", lambda group, name: [brought[name]] if name in brought else []
-    )
-    assert robots.get_robot("my_arm") == robots.get_robot("panda")
-    with pytest.raises(
-        UsageError, match=r"robot broken of my_lab\.robots:ARM: .*; expected the path of a YAML"
-    ):
-        robots.get_robot("broken")
