@@ -338,15 +338,6 @@ class WorldKind:
         """Return the options of `lerobot-eval` for this environment; [] if it cannot run there."""
         return []
 
-    def success(self, tolerance: float, steps: int) -> str:
-        """Return in words when an episode is a success.
-
-        Args:
-            tolerance: Largest error [m].
-            steps: Control steps in a row that must be within the tolerance.
-        """
-        return "as the environment itself reports it"
-
     def affecting(self, config: EnvConfig, condition: Condition, *, sees: bool) -> Condition | None:
         """Return the part of a condition that changes something.
 

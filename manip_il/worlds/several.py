@@ -338,10 +338,6 @@ class SeveralTasks(WorldKind):
         return self._kind.lerobot_words(robot, task)
 
     @override
-    def success(self, tolerance: float, steps: int) -> str:
-        return "as each task says"
-
-    @override
     def affecting(self, config: EnvConfig, condition: Condition, *, sees: bool) -> Condition | None:
         """Return the part of a condition that changes something in every task.
 

@@ -404,10 +404,6 @@ class LadderKind(WorldKind):
         )
 
     @override
-    def success(self, tolerance: float, steps: int) -> str:
-        return f"an error of at most {100 * tolerance:g} cm for {steps} control steps in a row"
-
-    @override
     def affecting(self, config: EnvConfig, condition: Condition, *, sees: bool) -> Condition | None:
         """Return the part of a condition that changes something for this task and policy.
 
