@@ -74,19 +74,6 @@ def config_scene(config: EnvConfig) -> Scene:
     return build_scene(*parts_of(config), config.physics_step)
 
 
-def env_of(
-    config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
-) -> ManipEnv:
-    """Return the environment that these settings describe.
-
-    Args:
-        config: The settings, complete.
-        cameras: Cameras rendered in every step; None for none.
-        conditions: How episodes differ from the nominal world, in turn by seed.
-    """
-    return ManipEnv(*parts_of(config), config, cameras=cameras, conditions=conditions)
-
-
 def make_env(
     robot: NameOrPath = EnvConfig.robot,
     task: NameOrPath = EnvConfig.task,
@@ -229,7 +216,10 @@ class LadderEnv(ManipEnv, Environment):
     """
 
     def __init__(
-        self, config: EnvConfig, cameras: CameraConfig | None, conditions: Sequence[Condition]
+        self,
+        config: EnvConfig,
+        cameras: CameraConfig | None = None,
+        conditions: Sequence[Condition] = (),
     ):
         super().__init__(*parts_of(config), config, cameras=cameras, conditions=conditions)
         self.actions = self.scene.actions
