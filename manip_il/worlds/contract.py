@@ -99,6 +99,7 @@ class EnvironmentSpec:
     # whether environments in one process share one compiled model
     shares_model: bool = _not_stored(True)
     has_progress: bool = _not_stored(True)  # whether `progress` says more than `solved`
+    drawing_version: int = _not_stored(0)  # a number that changes when pictures do
 
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
@@ -156,6 +157,11 @@ class EnvironmentSpec:
     def keypoint_keys(self) -> dict[str, str]:
         """Columns of keypoints: column -> camera; {} if there are no keypoints."""
         return {KEYPOINTS + camera: camera for camera in self.cameras if self.keypoints}
+
+    def look_sha256(self, cameras: CameraConfig) -> str:
+        """Return the hash of what determines the pictures of cameras, besides the state."""
+        look = f"{canonical_json(cameras)} {self.drawing_version}"
+        return hashlib.sha256(look.encode()).hexdigest()
 
     def require(self, ability: Ability, advice: str) -> None:
         """Raise `Unable` unless the environment has an ability.
@@ -322,16 +328,6 @@ class WorldKind:
 
     def fingerprint(self, config: EnvConfig) -> dict[str, str]:
         """Return versions and hashes of everything that determines the environment's numbers."""
-        raise NotImplementedError
-
-    def look_sha256(self, config: EnvConfig, cameras: CameraConfig) -> str:
-        """Return the hash of everything else that determines its pictures."""
-        return hashlib.sha256(
-            f"{canonical_json(cameras)} {self.drawing_version(config)}".encode()
-        ).hexdigest()
-
-    def drawing_version(self, config: EnvConfig) -> int:
-        """Return a number that changes when pictures do."""
         raise NotImplementedError
 
     def lerobot_words(self, robot: str, task: str) -> list[str]:

@@ -39,6 +39,7 @@ _MAY_DIFFER = {
     "points",
     "shares_model",
     "has_progress",
+    "drawing_version",
 }
 
 
@@ -114,6 +115,7 @@ class Tasks:
             points=(),
             shares_model=all(one.shares_model for one in specs),
             has_progress=all(one.has_progress for one in specs),
+            drawing_version=max(one.drawing_version for one in specs),
         )
 
     def united(self, number: int, numbers: F32) -> F32:
@@ -328,10 +330,6 @@ class SeveralTasks(WorldKind):
             key: of[0] if len(set(of)) == 1 else hashlib.sha256("\n".join(of).encode()).hexdigest()
             for key, of in values.items()
         }
-
-    @override
-    def drawing_version(self, config: EnvConfig) -> int:
-        return max(self._kind.drawing_version(part) for part in self._parts(config))
 
     @override
     def lerobot_words(self, robot: str, task: str) -> list[str]:

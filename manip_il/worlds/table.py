@@ -185,12 +185,10 @@ def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> d
     """Return package versions, processor, and hashes of the compiled model and of environment
     and camera settings.
     """
-    look = (
-        {}
-        if cameras is None
-        else {"cameras_sha256": world_of(config.robot, config.task).look_sha256(config, cameras)}
-    )
-    return _fingerprint(config) | look
+    found = _fingerprint(config)
+    if cameras is None:
+        return found
+    return found | {"cameras_sha256": env_spec(config).look_sha256(cameras)}
 
 
 @cache

@@ -22,7 +22,7 @@ from manip_il.worlds.aloha.expert import Arm, label
 from manip_il.worlds.aloha.insertion import Insertion
 from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, phases, read_hand
 from manip_il.worlds.aloha.transfer import Transfer
-from manip_il.worlds.config import WORLDS, EnvConfig
+from manip_il.worlds.config import WORLDS
 from manip_il.worlds.contract import GRIPPERS as GRIPPERS_OF
 from manip_il.worlds.contract import TWO_ARMS, EnvironmentSpec, Outcome
 from manip_il.worlds.gym.environment import GymEnv, GymKind, coordinates, installed
@@ -167,8 +167,13 @@ class AlohaEnv(GymEnv):
     @override
     def _described(self, horizon: int) -> EnvironmentSpec:
         found = super()._described(horizon)
-        can = (*found.can, "redrawn")
-        return replace(found, action_meaning=TWO_ARMS, state_names=(), can=can)
+        return replace(
+            found,
+            action_meaning=TWO_ARMS,
+            state_names=(),
+            can=(*found.can, "redrawn"),
+            drawing_version=DRAWN,
+        )
 
     @override
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
@@ -238,10 +243,6 @@ class AlohaEnv(GymEnv):
 
 class AlohaKind(GymKind):
     """The tasks of `gym_aloha`, which LeRobot's evaluator also runs."""
-
-    @override
-    def drawing_version(self, config: EnvConfig) -> int:
-        return DRAWN
 
     @override
     def lerobot_words(self, robot: str, task: str) -> list[str]:

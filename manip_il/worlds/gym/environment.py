@@ -255,6 +255,7 @@ class GymEnv(Environment):
             ends_solved=True,
             shares_model=False,
             has_progress=_overrides(world, "progress"),
+            drawing_version=DRAWN,
         )
 
 
@@ -354,10 +355,6 @@ class GymKind(WorldKind):
     @override
     def expert(self, config: EnvConfig) -> GymExpert:
         return GymExpert(partial(self.environment, config, None, ()))
-
-    @override
-    def drawing_version(self, config: EnvConfig) -> int:
-        return DRAWN
 
     @override
     def fingerprint(self, config: EnvConfig) -> dict[str, str]:

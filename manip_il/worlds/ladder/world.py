@@ -249,6 +249,7 @@ class LadderEnv(ManipEnv, Environment):
             all_cameras=CAMERAS,
             default_cameras=CAMERAS,
             points=point_names(scene),
+            drawing_version=DRAWN + (task.name.partition(":")[0] in _TURNED),
         )
 
     @override
@@ -378,10 +379,6 @@ class LadderKind(WorldKind):
         if config.object and (mesh := ObjectShape.parse(config.object).mesh):
             own["object_sha256"] = mesh.sha256
         return environment_fingerprint(model_bytes(config_scene(config).model), settings) | own
-
-    @override
-    def drawing_version(self, config: EnvConfig) -> int:
-        return DRAWN + (str(config.task).partition(":")[0] in _TURNED)
 
     @override
     def lerobot_words(self, robot: str, task: str) -> list[str]:
