@@ -35,7 +35,7 @@ from manip_il.mdp import Episode
 from manip_il.robots import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.world import env_of
+from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import env_spec, make_config
 
 BIN = Path(sys.executable).parent
@@ -99,7 +99,7 @@ def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, flo
 
 
 def replay_seconds(config: EnvConfig, episode: Episode) -> float:
-    env = env_of(config)
+    env = LadderEnv(config)
     env.start(episode.seed)
     scene, data = env.scene, env.data
     controls = np.zeros((len(episode), scene.model.nu))

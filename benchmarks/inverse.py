@@ -29,7 +29,7 @@ from manip_il.tasks.carry.grid import Grid, PathProblem, plan
 from manip_il.tasks.carry.layout import TASTES
 from manip_il.tasks.carry.obstacles import layout_of
 from manip_il.tasks.pick_place import OBJECT
-from manip_il.worlds.ladder.world import env_of
+from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import make_config
 
 F64 = NDArray[np.float64]
@@ -74,7 +74,7 @@ def unseen(robot: str, count: int, seed: int) -> Iterator[tuple[PathProblem, int
     """Yield the grids of layouts that are in no demonstration, and the node nearest to the
     object in each.
     """
-    env = env_of(make_config(robot, CARRY))
+    env = LadderEnv(make_config(robot, CARRY))
     for one in stream_seeds("held_out", count, seed):
         env.reset(seed=one)
         grid = Grid(layout_of(env.world), env.world.scene.robot)

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from _machine import describe_machine
 
-from manip_il.worlds.ladder.world import env_of
+from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import make_config
 
 # Mesa renders on the calling core, here and in the limit
@@ -170,7 +170,7 @@ def replay_seconds(job: RolloutJob, seed: int, actions: np.ndarray) -> float:
     """
     import mujoco  # after our import, which chooses the OpenGL backend
 
-    env = env_of(job.env)
+    env = LadderEnv(job.env)
     env.start(seed)
     model, data, physics_steps = env.scene.model, env.data, job.env.physics_steps
     space, gripper = env.scene.actions, env.scene.gripper
@@ -216,7 +216,7 @@ def bare_seconds(job: RolloutJob) -> float:
     """Return the seconds of some bare physics."""
     import mujoco
 
-    env = env_of(job.env)
+    env = LadderEnv(job.env)
     env.start(0)
     started = time.perf_counter()
     mujoco.mj_step(env.scene.model, env.data, BARE_STEPS)

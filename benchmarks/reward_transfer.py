@@ -39,7 +39,7 @@ from manip_il.tasks.carry.layout import OBSTACLES, TASTES, Layout, Reward
 from manip_il.tasks.carry.obstacles import EDGE, observed_layout
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.world import env_of, scene_of
+from manip_il.worlds.ladder.world import LadderEnv, scene_of
 from manip_il.worlds.table import env_spec, make_config
 
 FEW = 2  # most things in a demonstrated layout
@@ -154,7 +154,7 @@ def _seeds(env: EnvConfig, layouts: int, *, many: bool) -> Iterator[int]:
     """Yield seeds of layouts that are in no demonstration, identified by their first
     observation.
     """
-    simulated, left = env_of(env), layouts
+    simulated, left = LadderEnv(env), layouts
     names = env_spec(env).environment_state_names
     here = [names.index(f"{name}.here") for name in (*OBSTACLES, EDGE)]
     for seed in stream_seeds("held_out", _SPARE * layouts, 0):

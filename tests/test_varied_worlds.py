@@ -22,7 +22,7 @@ from manip_il.sim.env import ManipEnv
 from manip_il.sim.shape import KINDS as SHAPES
 from manip_il.sim.variation import with_drawn
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.world import env_of
+from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config
 
 from .pictures import read_episodes
@@ -55,12 +55,12 @@ def path_of(env: ManipEnv, state: State, steps: int) -> list[bytes]:
 )
 def test_a_restored_state_is_the_same_world_with_the_same_labels(robot: str, task: str, shape: str):
     config = make_config(robot, task, object=shape)
-    env = env_of(config, None, [condition(config, *KINDS)])
+    env = LadderEnv(config, None, [condition(config, *KINDS)])
     env.start(7)
     for _ in range(3):
         env.advance(Expert(env.scene).label(env.get_state()).action)
     vector = env.get_state().to_vector()
-    plain = env_of(config)
+    plain = LadderEnv(config)
     plain.start(8)
     restored = State.from_vector(vector)
     assert path_of(plain, restored, 4) == path_of(env, State.from_vector(vector), 4)
@@ -76,7 +76,7 @@ def test_pictures_of_restored_states_are_those_of_their_own_world(shape: str):
         make_config("panda", "pick_place", object=shape),
         CameraConfig(("front", "wrist"), 32, 32),
     )
-    env, plain = env_of(config, cameras, [condition(config, *KINDS)]), env_of(config, cameras)
+    env, plain = LadderEnv(config, cameras, [condition(config, *KINDS)]), LadderEnv(config, cameras)
     plain.start(2)
     before = plain.observe().images["front"]
     for seed in (1, 2):
@@ -110,7 +110,7 @@ def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(
         assert read_journal(path)[1].drawn == episode.drawn != {}
         state = State.from_vector(episode.columns[schema.SIM_STATE][0])
         np.testing.assert_array_equal(
-            state.variation, with_drawn(env_of(config).scene.nominal, episode.drawn)
+            state.variation, with_drawn(LadderEnv(config).scene.nominal, episode.drawn)
         )
     build(tmp_path / "varied.journals", tmp_path / "varied")
     assert [one.drawn for one in read_episodes(tmp_path / "varied")] == [

@@ -15,15 +15,14 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import (
-    FIELDS,
     complete,
     env_fingerprint,
     env_spec,
     stored_config,
-    world_of,
 )
 
 _LOG = logging.getLogger(__name__)
+_FLAGS = {"robot": "--robot.type", "task": "--task.type", "object": "--task.object"}
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 
 
@@ -35,12 +34,6 @@ def env_config(given: Mapping[str, Any], origin: Origin | None = None) -> EnvCon
     """
     values = {name: value for name, value in given.items() if value is not None}
     if origin is not None:
-        lacking = [one for one in own_files(origin) if FIELDS[one.partition("=")[0]] not in values]
-        if lacking:
-            raise UsageError(
-                f"the policy is for {origin.robot} {origin.task}, of a file of your own; give"
-                f" {' '.join(lacking)}"
-            )
         of_policy: dict[str, Any] = {"robot": origin.robot, "control_hz": origin.fps}
         of_policy |= {} if origin.task == UNKNOWN_TASK else {"task": origin.task}
         values = of_policy | values
@@ -49,24 +42,11 @@ def env_config(given: Mapping[str, Any], origin: Origin | None = None) -> EnvCon
     return complete(EnvConfig(**values))
 
 
-def own_files(spec: Any, shape: str = "") -> list[str]:
-    """Return the options, with FILE for a path, that commands need for what is the user's own.
-
-    Args:
-        spec: The `EnvironmentSpec` of a dataset or the `Origin` of a policy, which only name it.
-        shape: The object, if an option for a mesh is wanted, too.
-    """
-    if spec.task == UNKNOWN_TASK:
-        return []
-    return world_of(spec.robot, spec.task).own_files(spec, shape)
-
-
 def path_options(env: Mapping[str, Any]) -> list[str]:
     """Return the options of an environment that name files of the user's own, which nothing that
     is written stores.
     """
-    flags = {field: flag for flag, field in FIELDS.items()}
-    return [f"{flags[key]}={env[key]}" for key in flags if isinstance(env.get(key), Path)]
+    return [f"{flag}={env[key]}" for key, flag in _FLAGS.items() if isinstance(env.get(key), Path)]
 
 
 def open_dataset(root: Any) -> Dataset:
@@ -83,13 +63,14 @@ def open_dataset(root: Any) -> Dataset:
 def differences(dataset: Dataset) -> list[str]:
     """Return a line for each difference in versions or model between a dataset and this machine.
 
-    Raises `MismatchError` if joints or observations differ. A dataset of a user's own arm or task
-    is not compared, because it holds only the name of that arm or task.
+    Raises `MismatchError` if joints or observations differ. A dataset of a user's own arm, task
+    or mesh is not compared, because it holds only the name of it.
     """
     spec, name = dataset.spec, str(dataset.root)
-    if world_of(spec.robot, spec.task).own_files(spec, spec.object):
+    try:
+        env = stored_config(spec)
+    except UsageError:
         return []
-    env = stored_config(spec)
     check_same_spec(name, spec, "this program", env_spec(env))
     # Tolerance and horizon do not affect learning, and a dataset does not hold them; pictures are
     # not compared.

@@ -25,7 +25,6 @@ from manip_il.evaluation.report import (
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.side import Side, costs_of
 from manip_il.worlds.contract import UNNAMED
-from manip_il.worlds.table import world_of
 
 _MARKERS = ("o-", "s-", "D-", "^-")  # distinguishable without colour
 _PANEL = (4.4, 3.0)  # size of a figure placed beside others [inches]
@@ -39,9 +38,8 @@ def eval_report(result: EvalResult, films: Sequence[Film] = ()) -> Report:
         films: The films to show.
     """
     settings, success = result.settings, result.success
-    solved = world_of(result.robot, result.task).success(settings.tolerance, settings.success_steps)
-    end = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
-    note = f"Episodes have at most {settings.horizon:,} control steps. Success: {solved}{end}."
+    end = "" if settings.hold is None else f", and end {settings.hold} steps after success"
+    note = f"Episodes have at most {settings.horizon:,} control steps{end}."
     if result.until_width is not None:
         note += (
             " Intervals are from a confidence sequence, which is valid whenever the evaluation"

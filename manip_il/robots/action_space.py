@@ -21,8 +21,8 @@ class ActionSpace:
         high: Greatest command, likewise, (n,).
         scale: For a joint, the largest step of its target from its measured position [rad]; for the
             gripper, the range of its opening [m]; (n,).
-        relative: Whether a learner's target is relative to the measured position, (n,); true except
-            for the gripper.
+        relative: Whether the entry is the target of a joint, which moves relative to its measured
+            position, (n,).
         units: Set for a robot with servos: openings of its gripper [m], rising, (c,), and positions
             of the gripper's servo at these, (c,). `low`, `high`, `scale`, actions and measured
             states are then in degrees, the gripper's from 0 to 100.
@@ -84,13 +84,17 @@ class ActionSpace:
         return np.clip(action, self.low, self.high)
 
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
-        """Draw an action (n,) near a state, with any gripper opening.
+        """Draw an action (n,) whose `relative` entries are near a state.
 
         Args:
-            state: Measured joints and opening, (n,); the joint targets are within `scale` of it.
+            state: Measured values, (n,) if there are relative entries, which are drawn within
+                `scale` of them; the others are drawn within their bounds, without these from -1 to
+                1.
             rng: Generator to draw from.
         """
-        action = np.array(state, dtype=np.float64)
-        action[self.arm] += rng.uniform(-1, 1, len(action) - 1) * self.scale[self.arm]
-        action[self.gripper] = rng.uniform(self.low[self.gripper], self.high[self.gripper])
+        near, free = np.flatnonzero(self.relative), np.flatnonzero(~self.relative)
+        low, high = np.nan_to_num(self.low, neginf=-1), np.nan_to_num(self.high, posinf=1)
+        action = np.empty(len(self))
+        action[near] = state[near] + rng.uniform(-1, 1, len(near)) * self.scale[near]
+        action[free] = rng.uniform(low[free], high[free])
         return action

@@ -174,18 +174,14 @@ def turn_about_z(yaw: float) -> F64:
 def yaw_ahead(robot: Robot, shoulder: F64, position: F64) -> float:
     """Return the world yaw [rad] that counts as zero for the hand.
 
-    It is 0 unless the robot's zero yaw points away from the shoulder (`Robot.faces_ahead`).
+    It is 0, or the direction away from the shoulder for a robot that leans.
 
     Args:
         robot: The robot.
         shoulder: Position of the arm's first joint, (3,) [m].
         position: Position of the hand, (3,) [m].
     """
-    return (
-        math.atan2(position[1] - shoulder[1], position[0] - shoulder[0])
-        if robot.faces_ahead
-        else 0.0
-    )
+    return math.atan2(position[1] - shoulder[1], position[0] - shoulder[0]) if robot.leans else 0.0
 
 
 def angle_ahead(rotation: F64) -> float:

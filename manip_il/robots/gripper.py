@@ -153,16 +153,10 @@ class Gripper:
             return 0.0
         return float(np.interp(opening, self._sweep.openings, self._sweep.middles))
 
-    def commanded(self, commands: F64, before: F64) -> float:
-        """Return the opening [m] that commands ask for, by the one that changed most.
-
-        Args:
-            commands: The driven joints' commands, (g,).
-            before: Their commands before, (g,).
-        """
-        shares = (commands - self._closed) / self._travel
-        moved = np.abs(shares - (before - self._closed) / self._travel)
-        return float(np.interp(shares[moved.argmax()], self._sweep.shares, self._sweep.openings))
+    def commanded(self, commands: F64) -> float:
+        """Return the opening [m] that the first of the driven joints' commands (g,) asks for."""
+        share = (commands[0] - self._closed[0]) / self._travel[0]
+        return float(np.interp(share, self._sweep.shares, self._sweep.openings))
 
     def touches(self, model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> bool:
         """Return whether every finger touches a geom.

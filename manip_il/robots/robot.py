@@ -208,7 +208,6 @@ GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
 JOINT_STEP = 0.1  # largest step of a joint target from the measured position [rad]
 # found in the model if the YAML does not give them
 FOUND = ("home", "gains", "forces", "armature", "ee")
-YAWS = ("world", "shoulder")
 # beside the hand and behind the fingertips, in the frame `ee` [m]
 WRIST_CAMERA = (0.10, 0.0, -0.08)
 
@@ -377,6 +376,7 @@ class LeRobotConfig:
         return 100 * (joint - at_0) / (at_100 - at_0)
 
 
+_UPRIGHT_JOINTS = 6  # with fewer joints, a hand cannot point down everywhere
 UPRIGHT = Costs()
 # for an arm whose hand leans everywhere
 SOFT = Costs(orientation=0.02, leaning=0.02, posture=0.002)
@@ -398,9 +398,6 @@ class Robot:
         ee: The frame between the fingertips.
         gripper: The gripper.
         workspace: Volume in which tasks take place.
-        costs: Costs of inverse kinematics.
-        yaw: Where zero yaw points: along the world's x (`world`) or away from the shoulder
-            (`shoulder`).
         wrist_camera: Name of the model's camera on its hand, or position of an added one in the
             frame `ee` [m].
         cameras: Poses of the scene's cameras, front and side, that replace the default ones.
@@ -425,8 +422,6 @@ class Robot:
     ee: EndEffector
     gripper: GripperConfig
     workspace: Workspace
-    costs: Costs = UPRIGHT
-    yaw: str = "world"
     wrist_camera: tuple[float, float, float] | str = WRIST_CAMERA
     cameras: Mapping[str, CameraPose] = field(default_factory=dict, hash=False)
     table: TableTop = TableTop()
@@ -444,8 +439,6 @@ class Robot:
                 f"lerobot.names has {named} names; expected {count + 1}: the arm's, then the"
                 " gripper's"
             )
-        if self.yaw not in YAWS:
-            raise UnknownName("yaw", self.yaw, YAWS)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -458,11 +451,14 @@ class Robot:
         return self.lerobot.fps if self.lerobot is not None else RATE
 
     @property
-    def faces_ahead(self) -> bool:
-        """Whether yaw 0 of the hand points away from the shoulder, not along the world's x."""
-        return self.yaw != "world"
+    def leans(self) -> bool:
+        """Whether the hand leans everywhere, as too few joints cannot point it straight down.
+
+        Yaw 0 of such a hand points away from the shoulder, of any other along the world's x.
+        """
+        return len(self.joints) < _UPRIGHT_JOINTS
 
     @property
-    def leans(self) -> bool:
-        """Whether the hand leans everywhere, as too few joints cannot point it straight down."""
-        return self.costs.orientation == self.costs.leaning
+    def costs(self) -> Costs:
+        """Costs of inverse kinematics."""
+        return SOFT if self.leans else UPRIGHT

@@ -4,7 +4,6 @@ import typing
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +16,6 @@ from manip_il.robots.robot import (
     FOUND,
     GRIPPER,
     KEYS,
-    SOFT,
-    UPRIGHT,
-    YAWS,
-    Costs,
     GripperConfig,
     ModelFiles,
     Robot,
@@ -29,15 +24,13 @@ from manip_il.robots.robot import (
 from manip_il.robots.spec import arm_joints
 
 SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
-_UPRIGHT_JOINTS = 6  # with fewer joints, a hand cannot point down everywhere
-GROUP = "manip_il.robots"  # entry points: a robot's name, and the path of its YAML
 
 
 def get_robot(name: NameOrPath) -> Robot:
     """Return a robot.
 
     Args:
-        name: Its name, its entry point, or the `Path` of a YAML that the user gave.
+        name: Its name, or the `Path` of a YAML that the user gave.
 
     Raises:
         UnknownName: If there is no robot of this name.
@@ -47,21 +40,7 @@ def get_robot(name: NameOrPath) -> Robot:
         return _read(name.absolute())
     if name in ROBOTS:
         return _read(ROBOTS[name])
-    for found in entry_points(group=GROUP, name=name):
-        try:
-            path = Path(found.load())
-        except Exception as error:
-            why = checks.one_line(error)
-            raise UsageError(
-                f"robot {name} of {found.value}: {why}; expected the path of a YAML"
-            ) from error
-        return _read(path.absolute())
     raise UnknownName("robot", name, (*ROBOTS, "the path of a YAML or of a world's Python file"))
-
-
-def is_robot(name: str) -> bool:
-    """Return whether a robot of this name ships or an installed package provides it."""
-    return name in ROBOTS or bool(entry_points(group=GROUP, name=name))
 
 
 def read_robot(path: Path) -> Robot:
@@ -93,9 +72,7 @@ def read_robot(path: Path) -> Robot:
 
 
 def _said(path: Path, tree: Any) -> dict[str, Any]:
-    """The fields that a YAML gives, the arm's joints, and the defaults that depend on their
-    number.
-    """
+    """The fields that a YAML gives, and the arm's joints."""
     tree, kinds = dict(checks.mapping(str(path), tree)), typing.get_type_hints(Robot)
     known = (*KEYS, *(name for name in kinds if name not in ("name", "files")))
     for key in tree:
@@ -111,7 +88,6 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
         "files": ModelFiles.read("", tree, path.parent),
         "gripper": _gripper(checks.mapping("gripper", tree["gripper"]), path.parent),
     }
-    costs = checks.mapping("costs", tree.pop("costs", {}))
     for camera in checks.mapping("cameras", tree.get("cameras", {})):
         if camera not in SCENE_CAMERAS:
             raise UnknownName("camera in a robot's YAML:", camera, SCENE_CAMERAS)
@@ -122,12 +98,6 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
     }
     if "joints" not in said:
         said["joints"] = arm_joints(said["name"], said["files"], said["hand"], said["gripper"])
-    upright = len(said["joints"]) >= _UPRIGHT_JOINTS
-    said.setdefault("yaw", YAWS[not upright])
-    # such an arm leans, however much its orientation costs
-    if not upright and "orientation" in costs:
-        costs = {"leaning": costs["orientation"]} | costs
-    said["costs"] = read("costs", Costs, vars(UPRIGHT if upright else SOFT) | costs)
     return said
 
 

@@ -19,7 +19,7 @@ from manip_il.seeding import BLOCK, stream_seeds
 from manip_il.serve.station import Mover, Read, Station
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.ladder.expert import LadderExpert
-from manip_il.worlds.ladder.world import env_of
+from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import env_fingerprint, env_spec
 
 
@@ -50,7 +50,7 @@ class ServedEpisodes:
             MismatchError: If the folder's journals are of another robot, task or cameras.
         """
         self._station = station
-        self._env = env_of(config)
+        self._env = LadderEnv(config)
         self._leader = leader
         self._expert = LadderExpert(self._env.scene)
         self.driver = Actor.EXPERT

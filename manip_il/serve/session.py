@@ -23,7 +23,7 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.view import Window
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.world import WORLD, env_of
+from manip_il.worlds.ladder.world import WORLD, LadderEnv
 from manip_il.worlds.table import env_spec, world_of
 
 Say = Callable[[str], None]
@@ -60,7 +60,7 @@ def serve(
         stack.callback(weigh_session, weigh_session() or "0")
         if world_of(env.robot) is not WORLD:
             raise UsageError(f"{env_spec(env).robot} has no Feetech servos; choose another robot")
-        station = Station(env_of(env, None, conditions), config)
+        station = Station(LadderEnv(env, None, conditions), config)
         stack.callback(station.close)
         if cameras is not None:
             stack.callback(Cameras(station, cameras, config.camera_port).close)

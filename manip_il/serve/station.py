@@ -222,7 +222,7 @@ class Station:
     def to_action(self, joints: F64) -> F64:
         """Return the action (n,) that commands these joints [rad], (n,)."""
         scene, arm = self.env.scene, len(self.env.scene.arm_q)
-        return scene.actions.join(joints[:arm], scene.gripper.commanded(joints[arm:], joints[arm:]))
+        return scene.actions.join(joints[:arm], scene.gripper.commanded(joints[arm:]))
 
     def close(self) -> None:
         """Save the calibrations, close the ports, and remove their links."""

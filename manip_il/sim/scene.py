@@ -171,7 +171,7 @@ def _yaws(
     """Least and greatest yaw to which a robot's last joint turns the hand, relative to
     `yaw_ahead` [rad].
     """
-    if not robot.faces_ahead or not joints[-1].limited[0]:
+    if not robot.leans or not joints[-1].limited[0]:
         return -np.inf, np.inf
     data, last = mujoco.MjData(model), joints[-1]
     data.qpos[arm_q] = robot.home

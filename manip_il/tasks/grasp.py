@@ -226,7 +226,7 @@ def _nearest(
     """
     grasps, at = lie.grasps[lie.level], world.hand_yaw
     ahead, widest = world.ahead(position), world.gripper.most - LEAST_ROOM
-    if world.robot.faces_ahead:
+    if world.robot.leans:
         at = world.turned(position)
         grasps = [
             (turn, width, length, centre)

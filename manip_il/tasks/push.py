@@ -74,7 +74,7 @@ def _way(world: World) -> tuple[F64, float]:
 def _across(world: World, direction: F64) -> F64:
     """Rotation of a downward hand with its fingers across the push, the nearer of two, (3, 3)."""
     yaw, puck = math.atan2(direction[1], direction[0]), world.at(PUCK)
-    if world.robot.faces_ahead:
+    if world.robot.leans:
         at, turns = world.turned(puck), world.turns(yaw, math.pi, puck)
     else:
         at, turns = world.hand_yaw, [yaw - math.pi, yaw, yaw + math.pi]

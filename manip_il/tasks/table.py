@@ -73,15 +73,6 @@ def _shaped(task: Task, shape: NameOrPath) -> Task:
     return task.with_shape(ObjectShape.parse(shape))
 
 
-def is_task(name: str) -> bool:
-    """Return whether a task ships or an installed package provides it.
-
-    The task's code is not run.
-    """
-    base = name.partition(":")[0]
-    return base in TASKS or bool(entry_points(group=GROUP, name=base))
-
-
 @cache
 def _named(name: str) -> Task:
     if name in TASKS:

@@ -99,6 +99,7 @@ class EnvironmentSpec:
     # whether environments in one process share one compiled model
     shares_model: bool = _not_stored(True)
     has_progress: bool = _not_stored(True)  # whether `progress` says more than `solved`
+    drawing_version: int = _not_stored(0)  # a number that changes when pictures do
 
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
@@ -156,6 +157,11 @@ class EnvironmentSpec:
     def keypoint_keys(self) -> dict[str, str]:
         """Columns of keypoints: column -> camera; {} if there are no keypoints."""
         return {KEYPOINTS + camera: camera for camera in self.cameras if self.keypoints}
+
+    def look_sha256(self, cameras: CameraConfig) -> str:
+        """Return the hash of what determines the pictures of cameras, besides the state."""
+        look = f"{canonical_json(cameras)} {self.drawing_version}"
+        return hashlib.sha256(look.encode()).hexdigest()
 
     def require(self, ability: Ability, advice: str) -> None:
         """Raise `Unable` unless the environment has an ability.
@@ -324,40 +330,9 @@ class WorldKind:
         """Return versions and hashes of everything that determines the environment's numbers."""
         raise NotImplementedError
 
-    def look_sha256(self, config: EnvConfig, cameras: CameraConfig) -> str:
-        """Return the hash of everything else that determines its pictures."""
-        return hashlib.sha256(
-            f"{canonical_json(cameras)} {self.drawing_version(config)}".encode()
-        ).hexdigest()
-
-    def drawing_version(self, config: EnvConfig) -> int:
-        """Return a number that changes when pictures do."""
-        raise NotImplementedError
-
-    def own_files(self, spec: Any, shape: str) -> list[str]:
-        """Return the options that commands need for what is not built in.
-
-        Args:
-            spec: The `EnvironmentSpec` of a dataset or the `Origin` of a policy.
-            shape: The object, as a dataset stores it; empty for the task's default.
-
-        Returns:
-            Options with FILE for a path; [] if everything is built in.
-        """
-        return []
-
     def lerobot_words(self, robot: str, task: str) -> list[str]:
         """Return the options of `lerobot-eval` for this environment; [] if it cannot run there."""
         return []
-
-    def success(self, tolerance: float, steps: int) -> str:
-        """Return in words when an episode is a success.
-
-        Args:
-            tolerance: Largest error [m].
-            steps: Control steps in a row that must be within the tolerance.
-        """
-        return "as the environment itself reports it"
 
     def affecting(self, config: EnvConfig, condition: Condition, *, sees: bool) -> Condition | None:
         """Return the part of a condition that changes something.

@@ -104,10 +104,6 @@ class MetaworldKind(GymKind):
     """Meta-World's tasks, which LeRobot's evaluator also runs."""
 
     @override
-    def own_files(self, spec: Any, shape: str) -> list[str]:
-        return [] if spec.task in Metaworld.tasks else ["--env.task=TASK"]
-
-    @override
     def lerobot_words(self, robot: str, task: str) -> list[str]:
         return ["--env.type=metaworld", f"--env.task={task}"]
 

@@ -6,8 +6,7 @@ Recording, DAgger and evaluation need not know: the task is in an episode's text
 from __future__ import annotations
 
 import hashlib
-import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cache
 from typing import Any, override
@@ -40,6 +39,7 @@ _MAY_DIFFER = {
     "points",
     "shares_model",
     "has_progress",
+    "drawing_version",
 }
 
 
@@ -115,6 +115,7 @@ class Tasks:
             points=(),
             shares_model=all(one.shares_model for one in specs),
             has_progress=all(one.has_progress for one in specs),
+            drawing_version=max(one.drawing_version for one in specs),
         )
 
     def united(self, number: int, numbers: F32) -> F32:
@@ -157,9 +158,13 @@ class SeveralEnv(Environment):
 
     def __init__(self, tasks: Tasks, cameras: CameraConfig | None, conditions: Sequence[Condition]):
         self._tasks, self._settings = tasks, (cameras, tuple(conditions))
-        self._places = _places(tasks, *self._settings)
-        self._choose(0)
+        self._free = _free_envs(tasks, *self._settings)
+        self._number, self.one = 0, self._take(0)
         self.actions = self.one.actions
+
+    def __del__(self) -> None:
+        if hasattr(self, "one"):
+            self._free[self._number].append(self.one)
 
     @property
     @override
@@ -230,31 +235,23 @@ class SeveralEnv(Environment):
         return inner
 
     def _choose(self, number: int) -> None:
-        """Change to a task, in an environment of it that no other instance uses."""
-        self._number, self.place = number, None
-        places = self._places[number]
-        free = [one for one in places if (user := one.user()) is None or user.place is not one]
-        if not free:
-            free = [_Place(make_env(self._tasks.parts[number], *self._settings))]
-            places += free
-        self.place = free[0]
-        self.place.user = weakref.ref(self)
-        self.one = self.place.env
+        """Change to a task, and give the environment of the one before back."""
+        if number != self._number:
+            chosen = self._take(number)
+            self._free[self._number].append(self.one)
+            self._number, self.one = number, chosen
 
-
-class _Place:
-    """An environment of one task, and who uses it."""
-
-    def __init__(self, env: Environment):
-        self.env = env
-        self.user: Callable[[], SeveralEnv | None] = lambda: None
+    def _take(self, number: int) -> Environment:
+        """Return an environment of a task that no other instance uses."""
+        free = self._free[number]
+        return free.pop() if free else make_env(self._tasks.parts[number], *self._settings)
 
 
 @cached_per_thread(4)
-def _places(
+def _free_envs(
     tasks: Tasks, cameras: CameraConfig | None, conditions: tuple[Condition, ...]
-) -> list[list[_Place]]:
-    """Return the environments of each task, which outlive their users: making one takes long."""
+) -> list[list[Environment]]:
+    """Return the unused environments of each task, kept as making one takes long."""
     return [[] for _ in tasks.parts]
 
 
@@ -335,21 +332,8 @@ class SeveralTasks(WorldKind):
         }
 
     @override
-    def drawing_version(self, config: EnvConfig) -> int:
-        return max(self._kind.drawing_version(part) for part in self._parts(config))
-
-    @override
-    def own_files(self, spec: Any, shape: str) -> list[str]:
-        found = [self._kind.own_files(replace(spec, task=name), shape) for name in self.names]
-        return list(dict.fromkeys(option for options in found for option in options))
-
-    @override
     def lerobot_words(self, robot: str, task: str) -> list[str]:
         return self._kind.lerobot_words(robot, task)
-
-    @override
-    def success(self, tolerance: float, steps: int) -> str:
-        return "as each task says"
 
     @override
     def affecting(self, config: EnvConfig, condition: Condition, *, sees: bool) -> Condition | None:

@@ -23,14 +23,6 @@ if TYPE_CHECKING:
     from manip_il.sim.conditions import Condition
     from manip_il.worlds.contract import Environment, EnvironmentSpec, Expert, WorldKind
 
-# options that name files of the user's own -> fields of `EnvConfig`
-FIELDS = {
-    "--env.type": "robot",
-    "--robot.type": "robot",
-    "--env.task": "task",
-    "--task.type": "task",
-    "--task.object": "object",
-}
 _KEPT = 4  # environments and experts kept for each thread: the finest scenes take 64 MB
 
 
@@ -118,16 +110,9 @@ def stored_config(
         shape: See `robot`; the object.
 
     Raises:
-        UsageError: if something that is not built in was not given, and whatever else `make_config`
-            raises.
+        UnknownName: if a robot or a task that is not built in was not given.
+        UsageError: if a mesh was not given, and whatever else `make_config` raises.
     """
-    given = {"robot": robot, "task": task, "object": shape}
-    # what a mesh needs is told better below
-    needed = world_of(spec.robot, spec.task).own_files(spec, "")
-    if lacking := [one for one in needed if not given[FIELDS[one.partition("=")[0]]]]:
-        raise UsageError(
-            f"{spec.robot} {spec.task} was made with a file of your own; give {' '.join(lacking)}"
-        )
     named = {
         "robot": robot or spec.robot,
         "task": task or spec.task,
@@ -200,12 +185,10 @@ def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> d
     """Return package versions, processor, and hashes of the compiled model and of environment
     and camera settings.
     """
-    look = (
-        {}
-        if cameras is None
-        else {"cameras_sha256": world_of(config.robot, config.task).look_sha256(config, cameras)}
-    )
-    return _fingerprint(config) | look
+    found = _fingerprint(config)
+    if cameras is None:
+        return found
+    return found | {"cameras_sha256": env_spec(config).look_sha256(cameras)}
 
 
 @cache

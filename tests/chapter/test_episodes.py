@@ -7,7 +7,7 @@ import pytest
 
 from manip_il.chapter.episodes import ActionRange, Lockstep, RobotEpisode
 from manip_il.learn.action_spaces import Conversion
-from manip_il.worlds.ladder.world import env_of
+from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import make_config
 
 ENV = make_config("fetch", "reach")
@@ -28,7 +28,7 @@ def lockstep(count: int, hold: int | None = 2, horizon: int = 12) -> Lockstep:
 
 
 def test_a_target_reaches_the_robot_as_the_joints_it_means():
-    ours, env = lockstep(2, hold=None), env_of(ENV)
+    ours, env = lockstep(2, hold=None), LadderEnv(ENV)
     observed = ours.start(4)
     env.start(5)
     for step in range(3):

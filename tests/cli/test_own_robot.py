@@ -49,10 +49,7 @@ def test_it_is_recorded_learnt_evaluated_improved_and_rendered(
     assert (tmp_path / "dagger" / "best").is_dir()
     render = ["data", "render", "datasets/mine_reach", "seen", "--cameras=front"]
     assert main(render) == 2
-    assert (
-        "mine reach was made with a file of your own; give --robot.type=FILE.yaml"
-        in capsys.readouterr().err
-    )
+    assert "unknown robot 'mine'" in capsys.readouterr().err
     assert main([*render, "--robot.type=panda"]) == 1
     assert "robot differs" in capsys.readouterr().err
     assert main([*render, robot]) == 0

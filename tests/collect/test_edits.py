@@ -38,7 +38,7 @@ from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.variation import part
 from manip_il.sim.world import World
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.world import env_of, scene_of
+from manip_il.worlds.ladder.world import LadderEnv, scene_of
 from manip_il.worlds.table import env_fingerprint, env_spec, make_config, make_expert
 
 from ..damage import digests
@@ -239,7 +239,7 @@ def test_labels_with_the_servos_sag_keep_it_in_redrawn_scenes_and_lose_it_nowher
 def test_redrawn_scenes_are_observed_with_noise(visited, tmp_path):
     noisy = Scenes(None, 10, conditions=(Condition("noise", joint_noise=0.05),))
     redraw_dataset(visited, noisy, EditTarget(tmp_path / "noisy"))
-    env = env_of(visited.env)
+    env = LadderEnv(visited.env)
     for scene in read_episodes(tmp_path / "noisy"):
         env.set_state(State.from_vector(scene.columns["sim_state"][0]))
         assert (
@@ -268,7 +268,7 @@ def test_a_branch_is_the_experts_next_steps_and_looks_are_those_of_the_state(vis
     looks = (Condition("looks", colour=(0, 1), clutter=(2, 4)),)
     single = redrawn(visited, tmp_path / "1", 4, conditions=looks)
     branches = redrawn(visited, tmp_path / "3", 4, branch_steps=3, conditions=looks)
-    env, colours = env_of(ENV, SMALL), set()
+    env, colours = LadderEnv(ENV, SMALL), set()
     for one, three in zip(single, branches, strict=True):
         assert (len(one), len(three)) == (1, 3)
         np.testing.assert_array_equal(

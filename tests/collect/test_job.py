@@ -17,7 +17,7 @@ from manip_il.mdp import Actor, Episode, State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.events import STANDARD
-from manip_il.worlds.ladder.world import env_of, scene_of
+from manip_il.worlds.ladder.world import LadderEnv, scene_of
 from manip_il.worlds.table import env_spec, make_config
 
 from ..learn.tiny_policies import write_checkpoint
@@ -139,7 +139,7 @@ def test_branches_are_observed_with_the_noise_of_the_run(job: RolloutJob):
     for episode in run(noisy).values():
         _, *branches = parts(episode)
         states = [State.from_vector(one.columns["sim_state"][0]) for one in branches]
-        env = env_of(ENV)
+        env = LadderEnv(ENV)
         for one, state in zip(branches, states, strict=True):
             env.set_state(state)
             assert (

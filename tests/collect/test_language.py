@@ -22,7 +22,7 @@ from manip_il.data.dataset import Dataset
 from manip_il.learn.paraphrases import paraphrases
 from manip_il.mdp import Actor, State
 from manip_il.sim.config import CameraConfig
-from manip_il.worlds.ladder.world import env_of
+from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import make_config, make_env, make_expert
 
 from ..tables import one_arm_per_task
@@ -106,7 +106,7 @@ def test_lerobot_accepts_and_renders_all_of_it(roots, tmp_path):
 def test_answers_are_those_of_the_state(roots):
     asked = 0
     for root in roots:
-        dataset, env = Dataset.open(root), env_of(make_config("panda", "pick_place"))
+        dataset, env = Dataset.open(root), LadderEnv(make_config("panda", "pick_place"))
         keys = [f"privileged.keypoints.{name}" for name in CAMERAS.names]
         columns = dataset.columns(["sim_state", *keys])
         places = {"green goal": 0, "cube": 1}

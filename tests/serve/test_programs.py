@@ -21,7 +21,7 @@ from manip_il.data.journal import list_episodes, read_journal
 from manip_il.mdp import Actor, Episode
 from manip_il.serve.config import SessionConfig
 from manip_il.serve.station import Station
-from manip_il.worlds.ladder.world import env_of
+from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import make_config
 
 pytestmark = pytest.mark.slow
@@ -123,7 +123,8 @@ def ends(folder: Path) -> NDArray[np.int64]:
 def test_an_arm_is_calibrated(run: Run, tmp_path: Path):
     """The calibration that is found is the model's, to within two steps; the servos keep it."""
     Station(
-        env_of(make_config("so101", "lift")), SessionConfig(output_dir=tmp_path / "model" / "arm")
+        LadderEnv(make_config("so101", "lift")),
+        SessionConfig(output_dir=tmp_path / "model" / "arm"),
     ).close()
     model = ends(tmp_path / "model")
     run("lerobot-calibrate", arms="follower")

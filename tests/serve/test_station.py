@@ -18,7 +18,7 @@ from manip_il.cli.main import main
 from manip_il.errors import UsageError
 from manip_il.serve.config import VARIED, ServoConfig, SessionConfig
 from manip_il.serve.station import Station
-from manip_il.worlds.ladder.world import env_of
+from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import make_config
 
 from ..cli.made_runs import files
@@ -26,7 +26,7 @@ from ..cli.made_runs import files
 
 def station_of(folder: Path, servo: str = "sts3215", robot: str = "so101") -> Station:
     station = Station(
-        env_of(make_config(robot, "lift")), SessionConfig(output_dir=folder, servo=servo)
+        LadderEnv(make_config(robot, "lift")), SessionConfig(output_dir=folder, servo=servo)
     )
     station.reset(1)
     return station

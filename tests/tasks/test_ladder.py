@@ -45,9 +45,7 @@ class Placed:
     reach: Reach = UPRIGHT
     resting: bool = False
     gripper: ClassVar[Any] = SimpleNamespace(most=OPEN, lopsided=False, middle=lambda opening: 0.0)
-    robot: ClassVar[Any] = SimpleNamespace(
-        ee=SimpleNamespace(lowest=LOWEST), leans=False, faces_ahead=False
-    )
+    robot: ClassVar[Any] = SimpleNamespace(ee=SimpleNamespace(lowest=LOWEST), leans=False)
 
     @property
     def hand_yaw(self):

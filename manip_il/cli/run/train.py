@@ -9,7 +9,7 @@ import os
 from manip_il.cli.imitation import RANK, TrainOptions
 from manip_il.cli.outputs import Stages, say, say_next, set_quiet
 from manip_il.cli.transfer import ExportOptions
-from manip_il.collect.inputs import open_dataset, own_files, why_not_simulated
+from manip_il.collect.inputs import open_dataset, why_not_simulated
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import find_policy, read_config
@@ -54,8 +54,7 @@ def run_train(options: TrainOptions) -> None:
             program="lerobot-rollout",
         )
     else:
-        words = own_files(first.spec, first.spec.object)
-        say_next("eval", path, *words, f"--output_dir={folder}/eval")
+        say_next("eval", path, f"--output_dir={folder}/eval")
 
 
 EXPORTABLE = ("mlp", "cnn")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from manip_il.caching import cached_per_thread
 from manip_il.errors import RenderError
 from manip_il.mdp import F64, Label, State
+from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import LOOK_VERSION as DRAWN
 from manip_il.sim.render import REMEDY
@@ -21,10 +22,10 @@ from manip_il.worlds.aloha.expert import Arm, label
 from manip_il.worlds.aloha.insertion import Insertion
 from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, phases, read_hand
 from manip_il.worlds.aloha.transfer import Transfer
-from manip_il.worlds.config import WORLDS, EnvConfig
+from manip_il.worlds.config import WORLDS
 from manip_il.worlds.contract import GRIPPERS as GRIPPERS_OF
 from manip_il.worlds.contract import TWO_ARMS, EnvironmentSpec, Outcome
-from manip_il.worlds.gym.environment import GymActions, GymEnv, GymKind, coordinates, installed
+from manip_il.worlds.gym.environment import GymEnv, GymKind, coordinates, installed
 from manip_il.worlds.gym.restoring import WHOLE, physics_of
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 
@@ -50,17 +51,6 @@ _STAYS, _ELSEWHERE = 0.4, 0.08
 _COARSE = 240
 # least cell size of simplified meshes [m]; size of the shadow map [pixels]
 _CELL, _SHADOWS = 0.004, 1024
-
-
-class AlohaActions(GymActions):
-    """Joint targets [rad] and gripper commands, 0 to 1, of two arms."""
-
-    @override
-    def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
-        """Draw joint targets near the measured joints in `state` (14,), the grippers anywhere."""
-        action = np.asarray(state, np.float64) + rng.uniform(-LONGEST, LONGEST, len(self))
-        action[GRIPPERS] = rng.uniform(0.0, 1.0, len(GRIPPERS))
-        return action
 
 
 class Aloha(GymWorld):
@@ -168,17 +158,22 @@ class AlohaEnv(GymEnv):
         return super().step(action)._replace(ended=False)  # `ends_solved`, as the caller asks
 
     @override
-    def _found_actions(self) -> GymActions:
+    def _found_actions(self) -> ActionSpace:
         found = super()._found_actions()
-        scale = np.full(len(found), LONGEST)
-        scale[GRIPPERS] = 1.0
-        return AlohaActions(found.names, found.low, found.high, scale, found.relative)
+        is_joint = np.ones(len(found), bool)
+        is_joint[GRIPPERS] = False
+        return replace(found, scale=np.where(is_joint, LONGEST, 1.0), relative=is_joint)
 
     @override
     def _described(self, horizon: int) -> EnvironmentSpec:
         found = super()._described(horizon)
-        can = (*found.can, "redrawn")
-        return replace(found, action_meaning=TWO_ARMS, state_names=(), can=can)
+        return replace(
+            found,
+            action_meaning=TWO_ARMS,
+            state_names=(),
+            can=(*found.can, "redrawn"),
+            drawing_version=DRAWN,
+        )
 
     @override
     def redrawn(self, state: State, rng: np.random.Generator) -> State | None:
@@ -248,10 +243,6 @@ class AlohaEnv(GymEnv):
 
 class AlohaKind(GymKind):
     """The tasks of `gym_aloha`, which LeRobot's evaluator also runs."""
-
-    @override
-    def drawing_version(self, config: EnvConfig) -> int:
-        return DRAWN
 
     @override
     def lerobot_words(self, robot: str, task: str) -> list[str]:

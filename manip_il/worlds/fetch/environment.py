@@ -15,9 +15,10 @@ from gymnasium.wrappers import TransformObservation
 from numpy.typing import NDArray
 
 from manip_il.mdp import F64, Label, State
+from manip_il.robots.action_space import ActionSpace
 from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.worlds.fetch.expert import LADDERS, REACH, scene_of
-from manip_il.worlds.gym.environment import GymActions, GymEnv, GymKind, coordinates
+from manip_il.worlds.gym.environment import GymEnv, GymKind, coordinates
 from manip_il.worlds.gym.restoring import WHOLE, physics_of
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 
@@ -132,7 +133,7 @@ class FetchEnv(GymEnv):
         env.goal = state.variation.copy()
 
     @override
-    def _found_actions(self) -> GymActions:
+    def _found_actions(self) -> ActionSpace:
         return replace(super()._found_actions(), scale=np.array([1.0, 1.0, 1.0, 2.0]))
 
     @override

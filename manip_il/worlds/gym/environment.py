@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import cache, partial
 from importlib.metadata import entry_points, packages_distributions, version
 from pathlib import Path
@@ -45,19 +45,6 @@ from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 
 SEEDS = 4  # episodes that are begun to see what is part of a state
 _TOLERANCE = 0.05  # [m]; not used, as such a world says by itself what is solved
-
-
-@dataclass(frozen=True, eq=False)
-class GymActions(ActionSpace):
-    """Actions of any meaning, within bounds of which some may be infinite."""
-
-    @override
-    def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
-        """Draw any action within the bounds, (n,), whatever the state is; without bounds, -1 to
-        1.
-        """
-        low, high = np.nan_to_num(self.low, neginf=-1), np.nan_to_num(self.high, posinf=1)
-        return rng.uniform(low, high)
 
 
 class GymEnv(Environment):
@@ -214,14 +201,14 @@ class GymEnv(Environment):
         label = label or Label(action, 1, True, 0.0)
         return replace(label, action=np.clip(action, self.actions.low, self.actions.high))
 
-    def _found_actions(self) -> GymActions:
+    def _found_actions(self) -> ActionSpace:
         world, space = self.world, self.env.action_space
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
             raise UsageError(f"{_at(world, 'make')}: actions are {space}; expected a flat Box")
         low, high = (np.asarray(one, np.float64) for one in (space.low, space.high))
         scale = np.where(np.isfinite(high - low), high - low, 1.0)
         names = _names(world, "action", len(low))
-        return GymActions(names, low, high, scale, np.zeros(len(low), bool))
+        return ActionSpace(names, low, high, scale, np.zeros(len(low), bool))
 
     def _found_state(self, model: Any, data: Any) -> Simulated:
         """Return what restores the environment, as seen in the first steps of some episodes."""
@@ -268,6 +255,7 @@ class GymEnv(Environment):
             ends_solved=True,
             shares_model=False,
             has_progress=_overrides(world, "progress"),
+            drawing_version=DRAWN,
         )
 
 
@@ -367,15 +355,6 @@ class GymKind(WorldKind):
     @override
     def expert(self, config: EnvConfig) -> GymExpert:
         return GymExpert(partial(self.environment, config, None, ()))
-
-    @override
-    def drawing_version(self, config: EnvConfig) -> int:
-        return DRAWN
-
-    @override
-    def own_files(self, spec: Any, shape: str) -> list[str]:
-        tasks = self._cls.tasks
-        return [f"--task.type={'|'.join(tasks)}"] if tasks and spec.task not in tasks else []
 
     @override
     def fingerprint(self, config: EnvConfig) -> dict[str, str]:

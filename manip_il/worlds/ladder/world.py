@@ -25,7 +25,7 @@ from manip_il.own_file import source_hash
 from manip_il.robots import ROBOTS
 from manip_il.robots.robot import ModelFiles, Robot
 from manip_il.robots.spec import model_bytes
-from manip_il.robots.table import get_robot, is_robot
+from manip_il.robots.table import get_robot
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv, environment_state_names
@@ -33,16 +33,15 @@ from manip_il.sim.mesh import mesh_path
 from manip_il.sim.render import LOOK_VERSION as DRAWN
 from manip_il.sim.render import point_names
 from manip_il.sim.scene import Scene, build_scene
-from manip_il.sim.shape import MESH, ObjectShape, stored
+from manip_il.sim.shape import ObjectShape, stored
 from manip_il.sim.task import Task, phases
 from manip_il.sim.variation import part, with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks import ENV_IDS
-from manip_il.tasks.table import TASKS, get_task, is_task
+from manip_il.tasks.table import TASKS, get_task
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.contract import (
     OPENINGS,
-    OWN_ACTIONS,
     SERVOS,
     Environment,
     EnvironmentSpec,
@@ -73,19 +72,6 @@ def scene_of(robot: NameOrPath, task: NameOrPath, shape: NameOrPath = "") -> Sce
 def config_scene(config: EnvConfig) -> Scene:
     """Return the compiled scene of an environment."""
     return build_scene(*parts_of(config), config.physics_step)
-
-
-def env_of(
-    config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
-) -> ManipEnv:
-    """Return the environment that these settings describe.
-
-    Args:
-        config: The settings, complete.
-        cameras: Cameras rendered in every step; None for none.
-        conditions: How episodes differ from the nominal world, in turn by seed.
-    """
-    return ManipEnv(*parts_of(config), config, cameras=cameras, conditions=conditions)
 
 
 def make_env(
@@ -230,7 +216,10 @@ class LadderEnv(ManipEnv, Environment):
     """
 
     def __init__(
-        self, config: EnvConfig, cameras: CameraConfig | None, conditions: Sequence[Condition]
+        self,
+        config: EnvConfig,
+        cameras: CameraConfig | None = None,
+        conditions: Sequence[Condition] = (),
     ):
         super().__init__(*parts_of(config), config, cameras=cameras, conditions=conditions)
         self.actions = self.scene.actions
@@ -260,6 +249,7 @@ class LadderEnv(ManipEnv, Environment):
             all_cameras=CAMERAS,
             default_cameras=CAMERAS,
             points=point_names(scene),
+            drawing_version=DRAWN + (task.name.partition(":")[0] in _TURNED),
         )
 
     @override
@@ -325,7 +315,8 @@ class LadderKind(WorldKind):
 
         Fill in rate and task.
         """
-        task, robot = get_task(config.task), get_robot(config.robot)
+        robot = get_robot(config.robot)
+        task = get_task(config.task)
         for file in (config.task, config.robot, mesh_path(config.object)):
             if isinstance(file, Path):
                 check_unchanged(file)
@@ -390,18 +381,6 @@ class LadderKind(WorldKind):
         return environment_fingerprint(model_bytes(config_scene(config).model), settings) | own
 
     @override
-    def drawing_version(self, config: EnvConfig) -> int:
-        return DRAWN + (str(config.task).partition(":")[0] in _TURNED)
-
-    @override
-    def own_files(self, spec: Any, shape: str) -> list[str]:
-        if spec.action_meaning == OWN_ACTIONS:
-            return ["--env.type=FILE.py"]
-        robots = [] if is_robot(spec.robot) else ["--robot.type=FILE.yaml"]
-        meshes = ["--task.object=mesh:FILE:LENGTH"] if shape.startswith(MESH) else []
-        return [*robots, *([] if is_task(spec.task) else ["--task.type=FILE.py"]), *meshes]
-
-    @override
     def lerobot_words(self, robot: str, task: str) -> list[str]:
         name, colon, argument = task.partition(":")
         named = next((env_id for env_id, names in ENV_IDS.items() if names == (robot, name)), None)
@@ -410,10 +389,6 @@ class LadderKind(WorldKind):
             if named
             else []
         )
-
-    @override
-    def success(self, tolerance: float, steps: int) -> str:
-        return f"an error of at most {100 * tolerance:g} cm for {steps} control steps in a row"
 
     @override
     def affecting(self, config: EnvConfig, condition: Condition, *, sees: bool) -> Condition | None:
