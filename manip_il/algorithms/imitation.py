@@ -78,22 +78,19 @@ def dagger(
     return results
 
 
-def run_config(
-    env: EnvConfig | str, *, beta: str | None = None, query: str | None = None, **options: Any
-) -> RunConfig:
+def run_config(env: EnvConfig | str, *, query: str | None = None, **options: Any) -> RunConfig:
     """Return the options of a run.
 
     Args:
         env: The environment, or its name, `panda` or `panda/lift`.
-        beta: As on the command line, such as `"linear:5"`.
         query: As on the command line, such as `"probability:0.1"`.
-        options: Other fields of `RunConfig`.
+        options: Other fields of `RunConfig`; `beta` may be a text such as `"linear:5"`.
 
     Raises:
         UnknownName: for an option that there is not.
         UsageError: for a value that is not allowed.
     """
-    if beta is not None:
+    if isinstance(beta := options.get("beta"), str):
         options["beta"] = BetaSchedule.parse(beta)
     if query is not None:
         options["query_rule"] = parse_query(query)
