@@ -72,18 +72,13 @@ def say_next(*words: object, what: str = "next", program: str = "manip-il") -> N
     say(f"{what}: {shlex.join([program, *map(str, words)])}")
 
 
-def warn(*lines: str) -> None:
-    """Print warnings on standard error, one line each."""
-    for line in lines:
-        _print(f"manip-il: warning: {printable(' '.join(line.split()))}", sys.stderr)
-
-
 class Warnings(logging.Handler):
-    """Prints what is logged as a warning."""
+    """Prints what is logged as a warning on standard error, one line each."""
 
     @override
     def emit(self, record: logging.LogRecord) -> None:
-        warn(record.getMessage())
+        line = " ".join(record.getMessage().split())
+        _print(f"manip-il: warning: {printable(line)}", sys.stderr)
 
 
 def _print(line: str, file: TextIO) -> None:

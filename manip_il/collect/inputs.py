@@ -2,7 +2,6 @@
 policies fit it.
 """
 
-import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from manip_il import checks
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import check_same_spec
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError, UsageError, warn
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import (
@@ -23,7 +22,6 @@ from manip_il.worlds.table import (
     world_of,
 )
 
-_LOG = logging.getLogger(__name__)
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 
 
@@ -75,8 +73,7 @@ def open_dataset(root: Any) -> Dataset:
     Warn if it was made with other versions or another model, see `differences`.
     """
     dataset = Dataset.open(root)
-    for line in differences(dataset):
-        _LOG.warning(line)
+    warn(*differences(dataset))
     return dataset
 
 
@@ -129,8 +126,7 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
             if cameras or name != "cameras_sha256"
         }
         lines = compare_fingerprints(path, theirs, "the environment", env_fingerprint(env, cameras))
-    for line in lines:
-        _LOG.warning(line)
+    warn(*lines)
 
 
 def why_not_simulated(checkpoint: Checkpoint) -> str:

@@ -4,7 +4,6 @@ episode ends.
 Record a dataset: the expert's demonstrations, or a policy's rollouts with the expert's labels.
 """
 
-import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -217,9 +216,6 @@ def provenance(job: RolloutJob) -> dict[str, Any]:
     return {**source, "label": job.label, "query": str(job.query), **steps}
 
 
-_LOG = logging.getLogger(__name__)
-
-
 def record(
     root: Path | str,
     env: EnvConfig | str,
@@ -289,8 +285,7 @@ def record(
     done = len(list_seeds(journals))
     if any(root.glob("*")) and not done:
         raise UsageError(f"{root} cannot be continued without {journals}; choose another folder")
-    for line in journal_of(journals, job).prepare():
-        _LOG.warning(line)
+    journal_of(journals, job).prepare()
     recording = Recording(
         provenance=provenance(job),
         video=asdict(video) if job.cameras else {},

@@ -127,11 +127,7 @@ class Origin:
 
     def write(self, folder: Path) -> None:
         """Write `manip_il.json` into a `pretrained_model` folder."""
-        optional = ("object", "state_names")
-        values = {
-            name: value for name, value in asdict(self).items() if value or name not in optional
-        }
-        (folder / META_FILE).write_text(json.dumps(values, indent=2) + "\n")
+        (folder / META_FILE).write_text(json.dumps(asdict(self), indent=2) + "\n")
 
     def check_fits(self, spec: EnvironmentSpec) -> None:
         """Raise `MismatchError` naming both sides unless states and actions mean the same as in

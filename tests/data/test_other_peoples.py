@@ -67,7 +67,7 @@ def record(root: Path, tasks: list[str], **more: dict[str, Any]) -> Path:
 def check(root: Path, folder: Path) -> str:
     """Open, examine and train; return what the spec calls the joints."""
     dataset = Dataset.open(root)
-    assert sum(map(len, map(dataset.rows_of, range(dataset.info.episodes)))) == len(dataset)
+    assert dataset.episodes.length.sum() == len(dataset)
     assert len(dataset.columns()["action"]) == len(dataset) == dataset.info.frames
     assert [str(one) for one in examine_folder(root) if one.place != layout.STATS] == []
     policy = [

@@ -19,13 +19,13 @@ from manip_il.algorithms.run import Run
 from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.evaluate import CompareOptions, ComparisonOptions, StudyFile
 from manip_il.cli.imitation import DaggerOptions, DemoOptions
-from manip_il.cli.outputs import Stages, about, publish, say, say_next, warn
+from manip_il.cli.outputs import Stages, about, publish, say, say_next
 from manip_il.cli.parsing import from_layers, from_yaml
 from manip_il.collect.inputs import env_config, path_options
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.errors import ManipError, UnknownName, UsageError, warn
 from manip_il.evaluation.comparison import FILE_NAME, Comparison, Study
 from manip_il.evaluation.eval_report import compare_report, run_report, success_table
 from manip_il.evaluation.film import collect_films, film_episode, run_states
