@@ -211,26 +211,23 @@ def merge_datasets(
     opened = [Dataset.open(source) for source in roots]
     kept = choose_episodes(episodes, sum(one.info.episodes for one in opened))
     if joined := JoinedTasks.of(opened, provenance or {}):
-        for one in opened:
-            _check_same_facts(opened[0], one, ("film ", "meta/"))
-        chosen = (one for number, one in enumerate(joined.episodes()) if number in kept)
-        about = opened[0].fps, opened[0].info.robot, joined.own
-        tables = opened[0].other_tables
-        return write_episodes(chosen, root, joined.features, *about, tables=tables, replace=replace)
-    own = _merged_description(opened, provenance or {})
-    features: layout.Features = {}
+        own, features = joined.own, joined.features
+        stored = joined.episodes()
+    else:
+        own, features = _merged_description(opened, provenance or {}), _merged_features(opened)
+        stored = itertools.chain.from_iterable(one.stored_episodes() for one in opened)
+    first = opened[0]
     for one in opened:
-        _check_same_facts(opened[0], one)
-        for key, feature in one.stored_features.items():
-            # encoded if others have films
-            if features.setdefault(key, feature)["dtype"] == "image":
-                features[key] = feature
-
-    stored = itertools.chain.from_iterable(one.stored_episodes() for one in opened)
-    chosen = (one for number, one in enumerate(stored) if number in kept)
-    about = opened[0].fps, opened[0].info.robot, own
+        _check_same_facts(first, one, ("film ", "meta/") if joined else ("",))
     return write_episodes(
-        chosen, root, features, *about, tables=opened[0].other_tables, replace=replace
+        (one for number, one in enumerate(stored) if number in kept),
+        root,
+        features,
+        first.fps,
+        first.info.robot,
+        own,
+        tables=first.other_tables,
+        replace=replace,
     )
 
 
@@ -277,7 +274,17 @@ def _merged_description(opened: Sequence[Dataset], provenance: Mapping[str, Any]
     return Own(spec, own, {**provenance, "merged": sources})
 
 
-def _check_same_facts(left: Dataset, right: Dataset, kinds: tuple[str, ...] = ("",)) -> None:
+def _merged_features(opened: Sequence[Dataset]) -> layout.Features:
+    features: layout.Features = {}
+    for one in opened:
+        for key, feature in one.stored_features.items():
+            # encoded if others have films
+            if features.setdefault(key, feature)["dtype"] == "image":
+                features[key] = feature
+    return features
+
+
+def _check_same_facts(left: Dataset, right: Dataset, kinds: tuple[str, ...]) -> None:
     """Raise `MismatchError` unless two datasets can be merged. kinds: which facts to compare, by
     the beginnings of their names.
     """
