@@ -172,7 +172,7 @@ def test_pictures_are_of_the_state_alone(tmp_path):
             r"own\.py, line 22 \(act\): .*expected 1 finite numbers$",
         ),
         (("np.clip(-seen, -1, 1)", "1 / 0"), r"own\.py, line 23 \(act\): ZeroDivisionError"),
-        (("import numpy", "import numpyy"), r"own\.py, line 3 cannot be run: ModuleNotFoundError"),
+        (("import numpy", "import numpyy"), r"own\.py, line 3 \(<module>\): ModuleNotFoundError"),
         (
             ("return Line()", "return None"),
             r"own\.py, line 20 \(make\): returned None; expected a gym",
