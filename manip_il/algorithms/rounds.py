@@ -143,7 +143,7 @@ def read_rollouts(folder: Path, round_: int, beta: float) -> Rollouts:
         round_,
         dataset,
         beta,
-        labels=_count_labels(dataset) if dataset else 0,
+        labels=_count_labels(Dataset.open(dataset)) if dataset else 0,
         episodes=len(ends),
         successes=sum(success for _, success in ends),
         steps=sum(length for length, _ in ends),
@@ -165,8 +165,9 @@ def given_rollouts(folder: Path, datasets: Sequence[Path]) -> Rollouts:
         sources = {str(one): dataset_sha256(one) for one in datasets}
         merge_datasets(datasets, root, provenance={"given": sources})
     given = Dataset.open(root)
+    labels = _count_labels(given)
     return Rollouts(
-        0, root, 1.0, _count_labels(root), given.info.episodes, given.count_successes(), len(given)
+        0, root, 1.0, labels, given.info.episodes, given.count_successes(), len(given)
     )
 
 
@@ -183,8 +184,8 @@ def merge_rounds(datasets: Sequence[Path], root: Path, best: int) -> None:
         merge_datasets(datasets, root, provenance={"best_round": best}, replace=True)
 
 
-def _count_labels(root: Path) -> int:
-    return int(Dataset.open(root).columns([LABEL_VALID])[LABEL_VALID].sum())
+def _count_labels(dataset: Dataset) -> int:
+    return int(dataset.columns([LABEL_VALID])[LABEL_VALID].sum())
 
 
 def round_scenes(config: RunConfig, datasets: Sequence[Path]) -> Scenes:
