@@ -61,15 +61,9 @@ def say(*lines: str) -> None:
         _print(printable(line), sys.stdout)
 
 
-def say_next(*words: object, what: str = "next", program: str = "manip-il") -> None:
-    """Print a command to copy, quoted for a shell.
-
-    Args:
-        words: The words after the program's name.
-        what: What the command is for.
-        program: The program's name.
-    """
-    say(f"{what}: {shlex.join([program, *map(str, words)])}")
+def say_next(*words: object) -> None:
+    """Print the next command to copy, quoted for a shell. words: without the program's name."""
+    say(f"next: {shlex.join(['manip-il', *map(str, words)])}")
 
 
 class Warnings(logging.Handler):

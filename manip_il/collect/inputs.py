@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from manip_il import checks
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import check_same_spec
-from manip_il.errors import ManipError, UsageError, warn
+from manip_il.errors import UsageError, warn
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import (
@@ -127,16 +126,3 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
         }
         lines = compare_fingerprints(path, theirs, "the environment", env_fingerprint(env, cameras))
     warn(*lines)
-
-
-def why_not_simulated(checkpoint: Checkpoint) -> str:
-    """Return why no environment of this program fits a policy of another program's data.
-
-    "" if one does.
-    """
-    try:
-        env = env_config({}, checkpoint.origin)
-        checkpoint.check_fits(env_spec(env, checkpoint.cameras))
-    except ManipError as error:
-        return checks.one_line(error)
-    return ""

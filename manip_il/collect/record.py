@@ -29,7 +29,6 @@ from manip_il.data.journal import (
 )
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.checkpoint import policy_folder
 from manip_il.mdp import Episode
 from manip_il.option import make_options
 from manip_il.progress import Progress
@@ -268,9 +267,7 @@ def record(
     journals = journals_of(root)
     progress = progress or Progress()
     video = video or VideoConfig()
-    driver = (
-        RolloutJob.driver if policy is None else PolicyDriver.of(policy_folder(policy), beta=beta)
-    )
+    driver = RolloutJob.driver if policy is None else PolicyDriver.of(policy, beta=beta)
     chosen: dict[str, Any] = {
         "hold": HOLD,
         "round": 0 if policy is None else 1,

@@ -34,7 +34,7 @@ from manip_il.evaluation.results import (
 )
 from manip_il.evaluation.side import Side
 from manip_il.evaluation.suites import suite_conditions
-from manip_il.learn.checkpoint import Checkpoint, policy_folder
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import F64, Episode, State
 from manip_il.option import NameOrPath, make_options
 from manip_il.progress import Progress
@@ -386,11 +386,7 @@ def open_driver(
         MismatchError: if the policy cannot drive the environment.
         ManipError: if loading the policy needs `trust`.
     """
-    checkpoint = None
-    if policy is not None:
-        checkpoint = (
-            policy if isinstance(policy, Checkpoint) else Checkpoint.open(policy_folder(policy))
-        )
+    checkpoint = None if policy is None else Checkpoint.of(policy)
     origin = checkpoint.origin if checkpoint else None
     if env is None and origin is None:
         raise UsageError("env is missing, and the policy does not name one")

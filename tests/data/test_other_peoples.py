@@ -239,9 +239,7 @@ def test_joints_alone_of_any_robot_train_a_policy_that_lerobot_loads(tmp_path, s
     assert main(["train", *policy, *words]) == 0
     assert Dataset.open(tmp_path / "joints").info.robot == "my arm/v2.yaml"
     folder = tmp_path / "run/checkpoints/last/pretrained_model"
-    advice = capsys.readouterr().out.partition("no simulator of this program fits the policy: ")[2]
-    assert f"lerobot-rollout --strategy.type=base --policy.path={folder} " in advice
-    assert "manip-il eval" not in advice
+    assert "manip-il eval" not in capsys.readouterr().out
     ours = LearnedPolicy.load(folder)
     assert ours.checkpoint.numbers == {"observation.state": 3}
     assert ours.checkpoint.origin.robot == "my_arm_v2_yaml"
