@@ -14,6 +14,7 @@ from manip_il.cli.main import main
 from manip_il.collect.edits import EditTarget, open_source, relabel_dataset
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
+from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError, UsageError
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.config import EnvConfig
@@ -107,7 +108,11 @@ def test_stored_states_get_the_labels_that_they_had(tmp_path):
     with pytest.raises(UsageError, match=r"of your own; give --env\.type=FILE\.py$"):
         open_source(tmp_path / "demos")
     source = open_source(tmp_path / "demos", robot=env.robot)
-    assert relabel_dataset(source, EditTarget(tmp_path / "again", 1)) == 0
+    relabel_dataset(source, EditTarget(tmp_path / "again", 1))
+    demos, again = (
+        Dataset.open(tmp_path / name).columns(["action"]) for name in ("demos", "again")
+    )
+    np.testing.assert_allclose(again["action"], demos["action"], rtol=0, atol=1e-3)
 
 
 def test_states_that_cannot_be_restored_are_recorded_but_not_labelled_again(tmp_path):
