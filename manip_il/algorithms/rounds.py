@@ -166,9 +166,7 @@ def given_rollouts(folder: Path, datasets: Sequence[Path]) -> Rollouts:
         merge_datasets(datasets, root, provenance={"given": sources})
     given = Dataset.open(root)
     labels = _count_labels(given)
-    return Rollouts(
-        0, root, 1.0, labels, given.info.episodes, given.count_successes(), len(given)
-    )
+    return Rollouts(0, root, 1.0, labels, given.info.episodes, given.count_successes(), len(given))
 
 
 def merge_rounds(datasets: Sequence[Path], root: Path, best: int) -> None:
