@@ -141,6 +141,12 @@ def shorten(value: object) -> str:
     return printed if len(printed) <= _LONGEST_PRINTED else f"{printed[: _LONGEST_PRINTED - 3]}..."
 
 
+def warn(*lines: str) -> None:
+    """Log warnings, one line each, which the command line prints on standard error."""
+    for line in lines:
+        logging.getLogger("manip_il").warning("%s", line)
+
+
 def silence_ffmpeg_warning() -> None:
     """Hide LeRobot's long warning about missing FFmpeg libraries: we read video with PyAV, which
     has its own.

@@ -3,14 +3,12 @@
 import hashlib
 import inspect
 import sys
-import traceback
 from functools import cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
 
-from manip_il import checks
-from manip_il.errors import OWN, UsageError
+from manip_il.errors import OWN, UsageError, told
 
 
 @cache
@@ -34,9 +32,8 @@ def own_class[T](path: Path, base: type[T], wanted: str) -> type[T]:
         SourceFileLoader(name, str(path)).exec_module(module)
     except Exception as error:
         del sys.modules[name]
-        raise UsageError(
-            f"{_line(path, error)} cannot be run: {type(error).__name__}: {checks.one_line(error)}"
-        ) from error
+        why = " ".join(told(error).split())
+        raise UsageError(f"{path} cannot be run: {why}") from error
     found = [
         value
         for key, value in vars(module).items()
@@ -47,14 +44,6 @@ def own_class[T](path: Path, base: type[T], wanted: str) -> type[T]:
         names = ", ".join(cls.__name__ for cls in found) or "none"
         raise UsageError(f"{base.__name__}s in {path}: {names}; expected one subclass of {wanted}")
     return found[0]
-
-
-def _line(path: Path, error: BaseException) -> str:
-    """Return a file's path, with the last line that ran before an error."""
-    lines = [
-        one.lineno for one in traceback.extract_tb(error.__traceback__) if one.filename == str(path)
-    ]
-    return f"{path}, line {lines[-1]}" if lines else str(path)
 
 
 def source_hash(cls: type) -> str:

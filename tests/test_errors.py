@@ -3,8 +3,8 @@ import pickle
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.cli.outputs import say, warn
-from manip_il.errors import UnknownName, nearest, shorten
+from manip_il.cli.outputs import say
+from manip_il.errors import UnknownName, nearest, shorten, warn
 from manip_il.evaluation.report import Table
 
 
@@ -21,6 +21,7 @@ def test_no_control_character_of_a_name_reaches_a_terminal(capsys: pytest.Captur
     name = "\x1b[31mred\x07\x9b\udcff"
     error = UnknownName("body", "hand", [name])
     assert "known: \\x1b[31mred\\x07\\x9b\\udcff" in str(error)
+    main(["--help"])  # which prints warnings from here on
     for write in (say, warn, lambda line: Table(("joint",), ((line,),)).print()):
         write(name)
     assert main(["data", name]) == main(["robot", "check", f"{name}.yaml"]) == 2

@@ -1,7 +1,6 @@
 """Run DAgger, or another algorithm of imitation, in a folder."""
 
 import json
-import logging
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,15 +15,13 @@ from manip_il.collect.workers import Engine, engine_of
 from manip_il.data.atomic import CONFIG_FILE, output_of, require_ours, write_json
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import SIM_STATE, check_same_spec, features
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, MismatchError, UsageError, warn
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import make_options
 from manip_il.progress import Progress
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import env_fingerprint, env_of_name, env_spec
-
-_LOG = logging.getLogger(__name__)
 
 
 def dagger(
@@ -78,22 +75,19 @@ def dagger(
     return results
 
 
-def run_config(
-    env: EnvConfig | str, *, beta: str | None = None, query: str | None = None, **options: Any
-) -> RunConfig:
+def run_config(env: EnvConfig | str, *, query: str | None = None, **options: Any) -> RunConfig:
     """Return the options of a run.
 
     Args:
         env: The environment, or its name, `panda` or `panda/lift`.
-        beta: As on the command line, such as `"linear:5"`.
         query: As on the command line, such as `"probability:0.1"`.
-        options: Other fields of `RunConfig`.
+        options: Other fields of `RunConfig`; `beta` may be a text such as `"linear:5"`.
 
     Raises:
         UnknownName: for an option that there is not.
         UsageError: for a value that is not allowed.
     """
-    if beta is not None:
+    if isinstance(beta := options.get("beta"), str):
         options["beta"] = BetaSchedule.parse(beta)
     if query is not None:
         options["query_rule"] = parse_query(query)
@@ -132,8 +126,7 @@ def check_inputs(config: RunConfig) -> None:
 def _warn_of_changes(path: Path, now: dict[str, str]) -> None:
     """Warn if a run began in an environment other than now; then write what it is now."""
     before = checks.read_json(path, "a run's fingerprint") if path.is_file() else now
-    for line in compare_fingerprints(str(path.parent), before, "this program", now):
-        _LOG.warning(line)
+    warn(*compare_fingerprints(str(path.parent), before, "this program", now))
     write_json(path, now)
 
 

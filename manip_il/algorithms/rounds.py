@@ -8,7 +8,6 @@ round_003/policy/      the fit; the other members of an ensemble are policy_1, .
 round_003/eval.json    the validation
 """
 
-import logging
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ from manip_il.data.build import Recording, dataset_sha256, merge_datasets
 from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.data.schema import LABEL_VALID
-from manip_il.errors import NothingToLearnError
+from manip_il.errors import NothingToLearnError, warn
 from manip_il.learn.fit_config import LEROBOT, FitConfig
 from manip_il.learn.train import Trainer
 from manip_il.learn.training_state import PRETRAINED_MODEL
@@ -33,7 +32,6 @@ from manip_il.mdp import Episode
 from manip_il.seeding import stream_base
 from manip_il.worlds.table import env_spec
 
-_LOG = logging.getLogger(__name__)
 CHUNK_STEPS = 20_000  # default gradient steps per round for LeRobot's policies
 DATASET = "dataset"
 JOURNALS = "journals"
@@ -50,7 +48,6 @@ class Rollouts:
         dataset: The folder of the training data; None if the expert gave no label.
         beta: The expert's share of the steps.
         labels: Number of valid labels.
-        queries: Number of states in which the expert was queried.
         episodes: Number of rollouts.
         successes: Number of successful rollouts.
         steps: Simulated control steps.
@@ -60,7 +57,6 @@ class Rollouts:
     dataset: Path | None = None
     beta: float = 1.0
     labels: int = 0
-    queries: int = 0
     episodes: int = 0
     successes: int = 0
     steps: int = 0
@@ -126,38 +122,32 @@ def record_round(
         episodes: The journal and the episode of each rollout; iterating over it runs the rollouts.
         recording: How the dataset is made from the rollouts.
     """
-    for line in journal_of(folder / JOURNALS, job).prepare():
-        _LOG.warning("%s", line)
+    journal_of(folder / JOURNALS, job).prepare()
     try:
         recording.write(folder / JOURNALS)
         recording.make(episodes, folder / DATASET)
     except NothingToLearnError:
-        _LOG.warning("round %d: no labels, because the expert was never queried", job.round)
+        warn(f"round {job.round}: no labels, because the expert was never queried")
 
 
-def read_rollouts(folder: Path, round_: int, beta: float, *, queried_everywhere: bool) -> Rollouts:
+def read_rollouts(folder: Path, round_: int, beta: float) -> Rollouts:
     """Return a round's rollouts as found on disk.
 
     Args:
         folder: The folder of the round.
         round_: The number of the round.
         beta: The share of the steps that the expert drove.
-        queried_everywhere: Whether the expert was queried in every state; if not, every label
-            counts as a query.
     """
     ends = journal_ends(folder / JOURNALS)
     dataset = folder / DATASET if (folder / DATASET).is_dir() else None
-    labels = _count_labels(dataset) if dataset else 0
-    steps = sum(length for length, _ in ends)
     return Rollouts(
         round_,
         dataset,
         beta,
-        labels,
-        queries=steps if queried_everywhere else labels,
+        labels=_count_labels(Dataset.open(dataset)) if dataset else 0,
         episodes=len(ends),
         successes=sum(success for _, success in ends),
-        steps=steps,
+        steps=sum(length for length, _ in ends),
     )
 
 
@@ -175,10 +165,9 @@ def given_rollouts(folder: Path, datasets: Sequence[Path]) -> Rollouts:
     if not root.is_dir():
         sources = {str(one): dataset_sha256(one) for one in datasets}
         merge_datasets(datasets, root, provenance={"given": sources})
-    given, labels = Dataset.open(root), _count_labels(root)
-    return Rollouts(
-        0, root, 1.0, labels, labels, given.info.episodes, given.count_successes(), len(given)
-    )
+    given = Dataset.open(root)
+    labels = _count_labels(given)
+    return Rollouts(0, root, 1.0, labels, given.info.episodes, given.count_successes(), len(given))
 
 
 def merge_rounds(datasets: Sequence[Path], root: Path, best: int) -> None:
@@ -194,8 +183,8 @@ def merge_rounds(datasets: Sequence[Path], root: Path, best: int) -> None:
         merge_datasets(datasets, root, provenance={"best_round": best}, replace=True)
 
 
-def _count_labels(root: Path) -> int:
-    return int(Dataset.open(root).columns([LABEL_VALID])[LABEL_VALID].sum())
+def _count_labels(dataset: Dataset) -> int:
+    return int(dataset.columns([LABEL_VALID])[LABEL_VALID].sum())
 
 
 def round_scenes(config: RunConfig, datasets: Sequence[Path]) -> Scenes:

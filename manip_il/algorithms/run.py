@@ -142,7 +142,7 @@ class Run:
                 )
                 recording = Recording(True, count, provenance(job), labels=self._budget(round_))
                 record_round(here, job, episodes, recording)
-            self._made[round_] = read_rollouts(here, round_, beta=1.0, queried_everywhere=True)
+            self._made[round_] = read_rollouts(here, round_, beta=1.0)
         return self._made[round_]
 
     def held_out(self, count: int = 10) -> Path:
@@ -183,12 +183,13 @@ class Run:
         """
         here = self._folder(round_)
         config = self.config
-        rule = query or Query()
         count = config.episodes_per_round
         self._progress.start(f"round {round_}, collect", count)
         with self._clock.timed("collect"):
             if not (here / DATASET).is_dir():
-                job = round_job(config, round_, driver=driver, label=config.label, query=rule)
+                job = round_job(
+                    config, round_, driver=driver, label=config.label, query=query or Query()
+                )
                 if config.label == "branch":
                     job = replace(job, branch_steps=config.steps_of_branch)
                 if job.labels_all:
@@ -206,10 +207,7 @@ class Run:
                     labels=self._budget(round_),
                 )
                 record_round(here, job, episodes, recording)
-            everywhere = config.label == "per_state" and rule.kind in ("every", "safety")
-            self._made[round_] = read_rollouts(
-                here, round_, driver.beta, queried_everywhere=everywhere
-            )
+            self._made[round_] = read_rollouts(here, round_, driver.beta)
         return self._made[round_]
 
     def fit(self, data: Sequence[Rollouts]) -> Fitted:
@@ -257,9 +255,6 @@ class Run:
             metrics={
                 "beta": here.beta,
                 "labels": sum(one.labels for one in so_far),
-                # Exceeds `labels` if a query yields no label to learn from (`safety`, held-out
-                # episodes of `dart`).
-                "queries": sum(one.queries for one in so_far) + self._held_out_steps,
                 "rollout_success": here.successes / max(1, here.episodes),
             },
             policy=policy.path,

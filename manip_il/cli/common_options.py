@@ -128,6 +128,14 @@ class Pictured:
         return cameras
 
 
+@dataclass(frozen=True)
+class PolicyGroup:
+    """`--policy.*`: the policy that drives."""
+
+    path: Path | None = option(None, "a checkpoint or a run")
+    type: Literal["expert", "random"] | None = option(None, "who drives instead of a checkpoint")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Varied(Pictured):
     """Options of a command that randomises worlds and renders pictures."""

@@ -11,7 +11,7 @@ from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting
+from manip_il.cli.common_options import OF_POLICY, EngineOptions, PolicyGroup, Tested, Trusting
 from manip_il.cli.outputs import ResumableOutput, output_folder
 from manip_il.cli.parsing import Given, Open, given
 from manip_il.option import Seeded, option
@@ -20,11 +20,9 @@ from manip_il.worlds.config import EnvConfig
 
 
 @dataclass(frozen=True)
-class MeasuredPolicyGroup:
+class MeasuredPolicyGroup(PolicyGroup):
     """`--policy.*`: the policy to evaluate."""
 
-    path: Path | None = option(None, "a checkpoint or a run")
-    type: Literal["expert", "random"] | None = option(None, "who drives instead of a checkpoint")
     device: str = option("cpu", "where the policy runs: cpu or cuda")
 
 

@@ -61,29 +61,18 @@ def say(*lines: str) -> None:
         _print(printable(line), sys.stdout)
 
 
-def say_next(*words: object, what: str = "next", program: str = "manip-il") -> None:
-    """Print a command to copy, quoted for a shell.
-
-    Args:
-        words: The words after the program's name.
-        what: What the command is for.
-        program: The program's name.
-    """
-    say(f"{what}: {shlex.join([program, *map(str, words)])}")
-
-
-def warn(*lines: str) -> None:
-    """Print warnings on standard error, one line each."""
-    for line in lines:
-        _print(f"manip-il: warning: {printable(' '.join(line.split()))}", sys.stderr)
+def say_next(*words: object) -> None:
+    """Print the next command to copy, quoted for a shell. words: without the program's name."""
+    say(f"next: {shlex.join(['manip-il', *map(str, words)])}")
 
 
 class Warnings(logging.Handler):
-    """Prints what is logged as a warning."""
+    """Prints what is logged as a warning on standard error, one line each."""
 
     @override
     def emit(self, record: logging.LogRecord) -> None:
-        warn(record.getMessage())
+        line = " ".join(record.getMessage().split())
+        _print(f"manip-il: warning: {printable(line)}", sys.stderr)
 
 
 def _print(line: str, file: TextIO) -> None:

@@ -8,9 +8,15 @@ expert can do.
 
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import Literal
 
-from manip_il.cli.common_options import OF_POLICY, EngineOptions, Tested, Trusting, Varied
+from manip_il.cli.common_options import (
+    OF_POLICY,
+    EngineOptions,
+    PolicyGroup,
+    Tested,
+    Trusting,
+    Varied,
+)
 from manip_il.cli.outputs import Output, Replacing, output_folder
 from manip_il.cli.parsing import Given, given
 from manip_il.option import NameOrPath, Seeded, option
@@ -19,16 +25,6 @@ from manip_il.tasks import NAMES
 from manip_il.worlds.config import EnvConfig
 
 IN_A_FILE = 3  # episodes written to a file by default
-
-
-@dataclass(frozen=True)
-class WatchedPolicyGroup:
-    """`--policy.*`: the policy that drives."""
-
-    path: Path | None = option(None, "a checkpoint or a run")
-    type: Literal["expert", "random"] | None = option(
-        None, "who drives instead of a checkpoint, by default the expert"
-    )
 
 
 @dataclass(frozen=True)
@@ -43,7 +39,7 @@ class ViewOptions(Tested, Seeded, Trusting):
     Example: manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd
     """
 
-    policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
+    policy: PolicyGroup = field(default_factory=PolicyGroup)
     env: Given = given(EnvConfig, **OF_POLICY)
     n_episodes: int | None = option(
         None, f"episodes; by default unlimited, or {IN_A_FILE} with --output", at_least=1

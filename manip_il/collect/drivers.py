@@ -167,11 +167,8 @@ class PolicyDriver(Driver):
 
     @classmethod
     def of(cls, *policies: Checkpoint | Path, **settings: Any) -> PolicyDriver:
-        """Return the driver of checkpoints, or of `pretrained_model` folders, which are opened
-        here.
-        """
-        opened = (one if isinstance(one, Checkpoint) else Checkpoint.open(one) for one in policies)
-        return cls(tuple(opened), **settings)
+        """Return the driver of what `Checkpoint.of` opens."""
+        return cls(tuple(map(Checkpoint.of, policies)), **settings)
 
     @override
     def start(self, setting: Setting) -> Act:

@@ -30,7 +30,7 @@ from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.info import Info
 from manip_il.data.lerobot_layout import OURS, TASK_INDEX, Features
 from manip_il.data.lerobot_write import write_dataset, write_episodes
-from manip_il.errors import ManipError, MismatchError, NothingToLearnError
+from manip_il.errors import ManipError, MismatchError, NothingToLearnError, warn
 from manip_il.mdp import F64, I64, Actor, Episode, Label, Observation, State, Transition
 from manip_il.option import NameOrPath
 from manip_il.seeding import rng_for, stream_seeds
@@ -172,9 +172,7 @@ class SceneDrawer:
 
 Columns = dict[str, NDArray[Any]]
 _COMPARED = ("model_sha256", "mujoco")  # entries of a fingerprint that affect restored states
-_LABELS = (schema.ACTION, schema.LABEL_VALID, schema.EXPERT_PHASE)
 SERVED = "lerobot"  # `driver` of datasets recorded by LeRobot's programs from our servos
-_NOTICEABLE = 1e-3  # smallest change of a label that counts [unit of the action]
 
 
 @dataclass(frozen=True)
@@ -184,12 +182,10 @@ class EditSource:
     Attributes:
         dataset: The dataset.
         env: Settings of its environment.
-        warnings: Reasons why the restored world may differ from the recorded one.
     """
 
     dataset: Dataset
     env: EnvConfig
-    warnings: tuple[str, ...] = ()
 
     def check_has_no_sag(self, what: str) -> None:
         """Raise `ManipError` if the labels hold the sag of `serve`'s servos.
@@ -212,6 +208,8 @@ def open_source(
 ) -> EditSource:
     """Open a dataset whose states are to be restored.
 
+    Warn if the compiled model or MuJoCo's version differs.
+
     Args:
         root: The dataset's folder.
         robot: The robot as in `EnvConfig`, if it is the user's own; by default the one that the
@@ -220,8 +218,7 @@ def open_source(
         shape: The same for the object, if it is a mesh of the user's own.
 
     Returns:
-        The dataset and its environment, with warnings if the compiled model or MuJoCo's version
-        differs.
+        The dataset and its environment.
 
     Raises:
         ManipError: if the folder is not a dataset of ours.
@@ -247,8 +244,8 @@ def open_source(
             )
     here, there = env_fingerprint(env), dataset.fingerprint
     left, right = ({key: one.get(key, "nothing") for key in _COMPARED} for one in (there, here))
-    warnings = compare_fingerprints(str(root), left, "this machine", right)
-    return EditSource(dataset, env, tuple(warnings))
+    warn(*compare_fingerprints(str(root), left, "this machine", right))
+    return EditSource(dataset, env)
 
 
 @dataclass(frozen=True)
@@ -268,7 +265,7 @@ class EditTarget:
     on_piece: Callable[[], None] = lambda: None
 
 
-def relabel_dataset(source: EditSource, target: EditTarget) -> int:
+def relabel_dataset(source: EditSource, target: EditTarget) -> Info:
     """Write `source` with the current expert's label of every state.
 
     States in which the expert was not queried get a label, too. All other columns and the pictures
@@ -279,8 +276,7 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
         target: The new dataset's folder, and how it is written.
 
     Returns:
-        The number of frames whose label changed: its action by more than `_NOTICEABLE`, its phase,
-        or its validity.
+        The new dataset's `info.json`.
 
     Raises:
         ManipError: if the labels hold the sag of `serve`'s servos, or if a worker dies; also what
@@ -293,10 +289,8 @@ def relabel_dataset(source: EditSource, target: EditTarget) -> int:
     }
     fingerprint = {**env_fingerprint(source.env), **simulated}
     own = Own(dataset.spec, fingerprint, {**dataset.provenance, "relabelled": _origin(source)})
-    rewrite(source, target, partial(label_states, source.env), own, dataset.stored_features)
-    before, after = (one.columns(_LABELS) for one in (dataset, Dataset.open(target.root)))
-    gaps = [np.abs(before[key] - after[key]).reshape(len(dataset), -1) for key in _LABELS]
-    return int((np.hstack(gaps) > _NOTICEABLE).any(axis=1).sum())
+    work = partial(label_states, source.env)
+    return rewrite(source, target, work, own, dataset.stored_features)
 
 
 def render_dataset(source: EditSource, cameras: CameraConfig, target: EditTarget) -> Info:

@@ -2,16 +2,14 @@
 policies fit it.
 """
 
-import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from manip_il import checks
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import check_same_spec
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import UsageError, warn
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import (
@@ -21,7 +19,6 @@ from manip_il.worlds.table import (
     stored_config,
 )
 
-_LOG = logging.getLogger(__name__)
 _FLAGS = {"robot": "--robot.type", "task": "--task.type", "object": "--task.object"}
 _NOT_COMPARED = ("processor", "config_sha256", "cameras_sha256")
 
@@ -55,8 +52,7 @@ def open_dataset(root: Any) -> Dataset:
     Warn if it was made with other versions or another model, see `differences`.
     """
     dataset = Dataset.open(root)
-    for line in differences(dataset):
-        _LOG.warning(line)
+    warn(*differences(dataset))
     return dataset
 
 
@@ -110,18 +106,4 @@ def check_policy(checkpoint: Checkpoint, env: EnvConfig, *, trust: bool = False)
             if cameras or name != "cameras_sha256"
         }
         lines = compare_fingerprints(path, theirs, "the environment", env_fingerprint(env, cameras))
-    for line in lines:
-        _LOG.warning(line)
-
-
-def why_not_simulated(checkpoint: Checkpoint) -> str:
-    """Return why no environment of this program fits a policy of another program's data.
-
-    "" if one does.
-    """
-    try:
-        env = env_config({}, checkpoint.origin)
-        checkpoint.check_fits(env_spec(env, checkpoint.cameras))
-    except ManipError as error:
-        return checks.one_line(error)
-    return ""
+    warn(*lines)

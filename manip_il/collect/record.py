@@ -4,7 +4,6 @@ episode ends.
 Record a dataset: the expert's demonstrations, or a policy's rollouts with the expert's labels.
 """
 
-import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -30,7 +29,6 @@ from manip_il.data.journal import (
 )
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.checkpoint import policy_folder
 from manip_il.mdp import Episode
 from manip_il.option import make_options
 from manip_il.progress import Progress
@@ -217,9 +215,6 @@ def provenance(job: RolloutJob) -> dict[str, Any]:
     return {**source, "label": job.label, "query": str(job.query), **steps}
 
 
-_LOG = logging.getLogger(__name__)
-
-
 def record(
     root: Path | str,
     env: EnvConfig | str,
@@ -272,9 +267,7 @@ def record(
     journals = journals_of(root)
     progress = progress or Progress()
     video = video or VideoConfig()
-    driver = (
-        RolloutJob.driver if policy is None else PolicyDriver.of(policy_folder(policy), beta=beta)
-    )
+    driver = RolloutJob.driver if policy is None else PolicyDriver.of(policy, beta=beta)
     chosen: dict[str, Any] = {
         "hold": HOLD,
         "round": 0 if policy is None else 1,
@@ -289,8 +282,7 @@ def record(
     done = len(list_seeds(journals))
     if any(root.glob("*")) and not done:
         raise UsageError(f"{root} cannot be continued without {journals}; choose another folder")
-    for line in journal_of(journals, job).prepare():
-        _LOG.warning(line)
+    journal_of(journals, job).prepare()
     recording = Recording(
         provenance=provenance(job),
         video=asdict(video) if job.cameras else {},

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import itertools
-import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -26,10 +25,9 @@ from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.data.lerobot_write import write_dataset, write_episodes
 from manip_il.data.schema import LABEL_VALID, check_same_spec
 from manip_il.data.video_config import VideoConfig
-from manip_il.errors import ManipError, MismatchError, NothingToLearnError, UsageError
+from manip_il.errors import ManipError, MismatchError, NothingToLearnError, UsageError, warn
 from manip_il.mdp import Episode
 
-_LOG = logging.getLogger(__name__)
 RECORDING = "recording.json"
 _CODEC = ("video.codec", "video.pix_fmt")  # what all films of a camera have in common
 Rollouts = Iterable[tuple[Journal, Episode]]
@@ -147,8 +145,7 @@ def _compare(journal: Journal, name: str, about: Journal) -> None:
     first = "the first journal"
     if journal.spec != about.spec:
         raise MismatchError("spec (robot, task or cameras)", name, journal.spec, first, about.spec)
-    for line in compare_fingerprints(name, journal.fingerprint, first, about.fingerprint):
-        _LOG.warning("%s", line)
+    warn(*compare_fingerprints(name, journal.fingerprint, first, about.fingerprint))
 
 
 def _first_labels(episode: Episode, most: float) -> Episode:
@@ -214,26 +211,23 @@ def merge_datasets(
     opened = [Dataset.open(source) for source in roots]
     kept = choose_episodes(episodes, sum(one.info.episodes for one in opened))
     if joined := JoinedTasks.of(opened, provenance or {}):
-        for one in opened:
-            _check_same_facts(opened[0], one, ("film ", "meta/"))
-        chosen = (one for number, one in enumerate(joined.episodes()) if number in kept)
-        about = opened[0].fps, opened[0].info.robot, joined.own
-        tables = opened[0].other_tables
-        return write_episodes(chosen, root, joined.features, *about, tables=tables, replace=replace)
-    own = _merged_description(opened, provenance or {})
-    features: layout.Features = {}
+        own, features = joined.own, joined.features
+        stored = joined.episodes()
+    else:
+        own, features = _merged_description(opened, provenance or {}), _merged_features(opened)
+        stored = itertools.chain.from_iterable(one.stored_episodes() for one in opened)
+    first = opened[0]
     for one in opened:
-        _check_same_facts(opened[0], one)
-        for key, feature in one.stored_features.items():
-            # encoded if others have films
-            if features.setdefault(key, feature)["dtype"] == "image":
-                features[key] = feature
-
-    stored = itertools.chain.from_iterable(one.stored_episodes() for one in opened)
-    chosen = (one for number, one in enumerate(stored) if number in kept)
-    about = opened[0].fps, opened[0].info.robot, own
+        _check_same_facts(first, one, ("film ", "meta/") if joined else ("",))
     return write_episodes(
-        chosen, root, features, *about, tables=opened[0].other_tables, replace=replace
+        (one for number, one in enumerate(stored) if number in kept),
+        root,
+        features,
+        first.fps,
+        first.info.robot,
+        own,
+        tables=first.other_tables,
+        replace=replace,
     )
 
 
@@ -274,16 +268,23 @@ def _merged_description(opened: Sequence[Dataset], provenance: Mapping[str, Any]
     for one in opened:
         also = ("sim_state_size", "image_size", *(("task",) if one.own else ()))
         check_same_spec(str(about.root), about.spec, str(one.root), one.spec, also)
-        for warning in compare_fingerprints(
-            str(opened[0].root), own, str(one.root), one.fingerprint
-        ):
-            _LOG.warning("%s", warning)
+        warn(*compare_fingerprints(str(opened[0].root), own, str(one.root), one.fingerprint))
     sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
     spec = dataclasses.replace(about.spec, video=any(one.spec.video for one in opened))
     return Own(spec, own, {**provenance, "merged": sources})
 
 
-def _check_same_facts(left: Dataset, right: Dataset, kinds: tuple[str, ...] = ("",)) -> None:
+def _merged_features(opened: Sequence[Dataset]) -> layout.Features:
+    features: layout.Features = {}
+    for one in opened:
+        for key, feature in one.stored_features.items():
+            # encoded if others have films
+            if features.setdefault(key, feature)["dtype"] == "image":
+                features[key] = feature
+    return features
+
+
+def _check_same_facts(left: Dataset, right: Dataset, kinds: tuple[str, ...]) -> None:
     """Raise `MismatchError` unless two datasets can be merged. kinds: which facts to compare, by
     the beginnings of their names.
     """

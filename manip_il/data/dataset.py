@@ -36,7 +36,7 @@ from manip_il.data.parquet_files import (
     to_numpy,
 )
 from manip_il.data.statistics import Statistics, column_statistics, pool, read_statistics
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.errors import ManipError, UnknownName
 from manip_il.mdp import I64
 
 UNKNOWN_TASK = UNKNOWN_ROBOT = "unknown"
@@ -295,16 +295,6 @@ class Dataset:
         """Return a camera's decoded pictures, (B, height, width, 3), of these rows, (B,)."""
         return self.camera(key).rows(rows)
 
-    def rows_of(self, episode: int) -> I64:
-        """Return the rows of an episode, (T,). Raises `UsageError` if it does not exist."""
-        if not 0 <= episode < self.info.episodes:
-            raise UsageError(
-                f"{self.root} has no episode {episode}; it has 0 to {self.info.episodes - 1}"
-            )
-        table = self.episodes
-        [place] = np.flatnonzero(table.index == episode)[:1]
-        return np.arange(table.start[place], table.start[place] + table.length[place])
-
     @property
     def stored_features(self) -> layout.Features:
         """The features in `info.json`, with everything that it says of them, without LeRobot's
@@ -418,7 +408,6 @@ class JoinedDatasets:
 
     def __init__(self, datasets: Sequence[Dataset]):
         self.datasets, first = tuple(datasets), datasets[0]
-        self.roots = tuple(one.root for one in datasets)
         self.repo_id, self.fps = f"local/{first.root.name}", first.fps
         self.features: Features = {
             key: {"dtype": one.dtype, "shape": one.shape, "names": one.names}
@@ -430,7 +419,6 @@ class JoinedDatasets:
             and (one.is_rgb or one.dtype not in PICTURES)
         }
         self.camera_keys = [key for key, one in self.features.items() if one["dtype"] in PICTURES]
-        self.total_frames = sum(map(len, self.datasets))
         self.stats = self._statistics()
         self.tasks = list(
             dict.fromkeys(text for one in self.datasets for text in one.tasks.values())

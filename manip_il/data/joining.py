@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,13 +12,12 @@ from manip_il.data import schema
 from manip_il.data.dataset import Dataset, EpisodeData, Own
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.lerobot_layout import Features
-from manip_il.errors import MismatchError
+from manip_il.errors import MismatchError, warn
 from manip_il.mdp import KEYPOINTS, State
 from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.worlds.several import SeveralTasks, Tasks
 from manip_il.worlds.table import env_fingerprint, stored_config, world_of
 
-_LOG = logging.getLogger(__name__)
 _SAME = ("cameras", "image_size", "video")
 
 
@@ -74,8 +72,7 @@ class JoinedTasks:
             for one in datasets:
                 there = {key: one.fingerprint[key] for key in here if key in one.fingerprint}
                 if one.spec.task == part.task:
-                    for text in compare_fingerprints("this machine", here, str(one.root), there):
-                        _LOG.warning("%s", text)
+                    warn(*compare_fingerprints("this machine", here, str(one.root), there))
         look = {key: one for key, one in datasets[0].fingerprint.items() if "cameras" in key}
         sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in datasets]
         own = Own(spec, env_fingerprint(config) | look, {**provenance, "merged": sources})

@@ -23,7 +23,7 @@ from manip_il.data import foxglove
 from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import IMAGES, check_same_spec, exact_rate
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, warn
 from manip_il.mdp import Episode
 from manip_il.worlds.contract import EnvironmentSpec
 
@@ -76,8 +76,8 @@ class Journal:
         """Encode and store one episode; return its path."""
         return self.store(episode.seed, self.encode(episode))
 
-    def prepare(self) -> list[str]:
-        """Check that episodes can be added to the folder; return warnings to show.
+    def prepare(self) -> None:
+        """Check that episodes can be added to the folder; warn if its fingerprint differs.
 
         Removes unfinished files of killed writers, so no other writer may be running. Checks the
         first journal only: raises `MismatchError` if it has another robot, task or cameras, and
@@ -86,12 +86,14 @@ class Journal:
         for leftover in self.folder.glob(f".episode-*{PARTIAL}"):
             leftover.unlink(missing_ok=True)
         if not (paths := list_episodes(self.folder)):
-            return []
+            return
         there, _ = read_journal(paths[0])
         here, also = f"{self.spec.robot} {self.spec.task}", ("task", "cameras", "image_size")
         check_same_spec(str(self.folder), there.spec, here, self.spec, also)
-        return compare_fingerprints(
-            str(self.folder), there.fingerprint, "this machine", self.fingerprint
+        warn(
+            *compare_fingerprints(
+                str(self.folder), there.fingerprint, "this machine", self.fingerprint
+            )
         )
 
 

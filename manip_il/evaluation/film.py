@@ -1,7 +1,6 @@
 """Films of episodes, rendered from their recorded states."""
 
 import io
-import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -13,7 +12,7 @@ from manip_il.collect.edits import render_states
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.errors import RenderError
+from manip_il.errors import RenderError, warn
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.results import EvalResult
 from manip_il.mdp import Episode
@@ -25,7 +24,6 @@ from manip_il.worlds.table import env_spec
 
 FILM_EVERY = 2  # control steps per frame of film
 _SIZE = (240, 320)  # height and width [pixels]
-_LOG = logging.getLogger(__name__)
 
 
 def run_states(job: RolloutJob, seed: int) -> Episode:
@@ -65,7 +63,7 @@ def collect_films(made: Iterable[Film], progress: Progress) -> list[Film]:
             films.append(film)
             progress.step()
     except (RenderError, Unable) as error:
-        _LOG.warning("the report has no films: %s", error)
+        warn(f"the report has no films: {error}")
         return []
     finally:
         progress.close()

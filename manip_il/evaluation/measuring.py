@@ -4,7 +4,6 @@ Finished episodes are saved at once, and any episode can be run again alone.
 """
 
 import itertools
-import logging
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from manip_il.collect.workers import Engine, engine_of
 from manip_il.data import schema
 from manip_il.data.atomic import append_line, read_lines
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.errors import MismatchError, UsageError, shorten
+from manip_il.errors import MismatchError, UsageError, shorten, warn
 from manip_il.evaluation.eval_report import eval_report
 from manip_il.evaluation.film import film_outcomes, run_states
 from manip_il.evaluation.intervals import Proportion
@@ -35,7 +34,7 @@ from manip_il.evaluation.results import (
 )
 from manip_il.evaluation.side import Side
 from manip_il.evaluation.suites import suite_conditions
-from manip_il.learn.checkpoint import Checkpoint, policy_folder
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.mdp import F64, Episode, State
 from manip_il.option import NameOrPath, make_options
 from manip_il.progress import Progress
@@ -217,7 +216,6 @@ def replay_differences(before: EpisodeResult, after: EpisodeResult) -> list[str]
     ]
 
 
-_LOG = logging.getLogger(__name__)
 _MOST_UNTIL_WIDTH = 10_000  # episodes, if their number is not given
 _NO_FILES = ("expert", "random")  # drivers without a checkpoint
 Env = EnvConfig | str | Mapping[str, Any]
@@ -388,11 +386,7 @@ def open_driver(
         MismatchError: if the policy cannot drive the environment.
         ManipError: if loading the policy needs `trust`.
     """
-    checkpoint = None
-    if policy is not None:
-        checkpoint = (
-            policy if isinstance(policy, Checkpoint) else Checkpoint.open(policy_folder(policy))
-        )
+    checkpoint = None if policy is None else Checkpoint.of(policy)
     origin = checkpoint.origin if checkpoint else None
     if env is None and origin is None:
         raise UsageError("env is missing, and the policy does not name one")
@@ -470,10 +464,9 @@ def replay(
     settings = result.settings
     job = RolloutJob(env, driver, settings.hold, label="last", conditions=settings.conditions)
     if job.policy is not None and result.policy_sha256 not in ("", job.policy.sha256):
-        _LOG.warning("%s is not the policy of %s: its files differ", policy, file)
+        warn(f"{policy} is not the policy of {file}: its files differ")
     here = env_fingerprint(env, observed_cameras(job))
-    for line in compare_fingerprints(str(file), dict(result.fingerprint), "this machine", here):
-        _LOG.warning(line)
+    warn(*compare_fingerprints(str(file), dict(result.fingerprint), "this machine", here))
     episode = run_states(job, seed)
     return Replay(
         by_seed[seed], job, episode, replay_differences(by_seed[seed], episode_result(job, episode))

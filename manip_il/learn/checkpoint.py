@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -127,11 +126,7 @@ class Origin:
 
     def write(self, folder: Path) -> None:
         """Write `manip_il.json` into a `pretrained_model` folder."""
-        optional = ("object", "state_names")
-        values = {
-            name: value for name, value in asdict(self).items() if value or name not in optional
-        }
-        (folder / META_FILE).write_text(json.dumps(values, indent=2) + "\n")
+        (folder / META_FILE).write_text(json.dumps(asdict(self), indent=2) + "\n")
 
     def check_fits(self, spec: EnvironmentSpec) -> None:
         """Raise `MismatchError` naming both sides unless states and actions mean the same as in
@@ -190,6 +185,16 @@ class Checkpoint:
     def __repr__(self) -> str:
         trained_for = f"{self.origin.robot} {self.origin.task}" if self.origin else "unknown"
         return f"Checkpoint({self.kind}, {trained_for}, {str(self.path)!r})"
+
+    @classmethod
+    def of(cls, policy: Checkpoint | Path | str) -> Checkpoint:
+        """Return a checkpoint as it is, or open the one that `find_policy` finds in a path.
+
+        Raises what `find_policy` and `open` raise.
+        """
+        if isinstance(policy, Checkpoint):
+            return policy
+        return cls.open(find_policy(Path(policy).expanduser()))
 
     @classmethod
     def open(cls, path: Path) -> Checkpoint:
@@ -416,7 +421,6 @@ _PLACES = (
     *(".", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model"),
     *("checkpoints/*/pretrained_model", "round_*/policy/checkpoints/*/pretrained_model"),
 )
-_REPO = re.compile(r"[A-Za-z0-9_][\w.-]*/[A-Za-z0-9_][\w.-]*")
 
 
 def find_policy(path: Path) -> Path:
@@ -429,19 +433,8 @@ def find_policy(path: Path) -> Path:
     for place in _PLACES:
         if found := sorted(path.glob(f"{place}/{CONFIG}")):
             return found[-1].parent
-    wanted = f"LeRobot's pretrained_model folder, or a run that holds one{hub_hint(path)}"
-    raise UsageError(f"no policy in {path}; expected {wanted}")
-
-
-def hub_hint(path: Path) -> str:
-    """Return how to pull a path that looks like a Hub repository; "" for any other path."""
-    if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
-        return ""
-    return f"; if it is on the Hub, get it by manip-il pull hf://{path} FOLDER and give that FOLDER"
-
-
-def policy_folder(policy: Any) -> Path:
-    """Return the `pretrained_model` folder of a `Checkpoint`, or of a path that `find_policy`
-    takes.
-    """
-    return find_policy(Path(getattr(policy, "path", policy)).expanduser())
+    raise UsageError(
+        f"no policy in {path}; expected LeRobot's pretrained_model folder, or a run that holds"
+        " one; if it is on the Hub, get it by manip-il pull hf://USER/NAME FOLDER and give that"
+        " FOLDER"
+    )

@@ -8,7 +8,6 @@ mean.
 import io
 import json
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, override
 
@@ -108,7 +107,7 @@ def export_onnx(checkpoint: Checkpoint | Path) -> tuple[bytes, float]:
         )
     model = onnx.load_model_from_string(content.getvalue())
     model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = checkpoint.action
-    onnx.helper.set_model_props(model, metadata(checkpoint, function.inputs))
+    onnx.helper.set_model_props(model, metadata(checkpoint))
     model.producer_name = "manip-il"
     onnx.checker.check_model(model, full_check=True)
     data = model.SerializeToString()
@@ -124,44 +123,31 @@ def export_onnx(checkpoint: Checkpoint | Path) -> tuple[bytes, float]:
     return data, difference
 
 
-def metadata(checkpoint: Checkpoint, inputs: Sequence[str]) -> dict[str, str]:
-    """Return the ONNX file's metadata: policy, inputs and outputs, and, if known, robot and
-    task.
+def metadata(checkpoint: Checkpoint) -> dict[str, str]:
+    """Return the ONNX file's metadata: the policy and, if known, robot, task, rate, the meaning of
+    actions, and the names of the numbers of inputs and output as JSON.
     """
     origin = checkpoint.origin
-    entries: dict[str, Any] = {
-        "inputs": [_entry(checkpoint, key) for key in inputs],
-        "outputs": [_entry(checkpoint, ACTION)],
+    entries = {
         "policy_type": checkpoint.kind,
-        "policy_loss": checkpoint.config["loss"],
+        "policy_loss": str(checkpoint.config["loss"]),
         "policy_sha256": checkpoint.sha256,
     }
-    if origin is not None:
-        entries |= {
-            "robot": origin.robot,
-            "task": origin.task,
-            "action_meaning": origin.action_meaning,
-            "control_rate_hz": origin.fps,
-        }
-    return {
-        key: value if isinstance(value, str) else json.dumps(value)
-        for key, value in entries.items()
+    if origin is None:
+        return entries
+    names = {
+        STATE: origin.state_names or origin.joint_names,
+        ENVIRONMENT_STATE: origin.environment_state_names,
+        ACTION: origin.joint_names,
     }
-
-
-def _entry(checkpoint: Checkpoint, key: str) -> dict[str, Any]:
-    """Return the name, type and shape of an input or output, and the names of its numbers, if
-    known.
-    """
-    if key.startswith(IMAGES):
-        shape = ["batch", *checkpoint.pictures[key.removeprefix(IMAGES)], 3]
-        return {"name": key, "dtype": "uint8", "shape": shape}
-    size = checkpoint.action if key == ACTION else checkpoint.numbers[key]
-    entry = {"name": key, "dtype": "float32", "shape": ["batch", size]}
-    if origin := checkpoint.origin:
-        ours = origin.environment_state_names if key == ENVIRONMENT_STATE else origin.joint_names
-        entry["names"] = list(ours)
-    return entry
+    known = {key: names[key] for key in names if key in (*checkpoint.numbers, ACTION)}
+    return entries | {
+        "robot": origin.robot,
+        "task": origin.task,
+        "action_meaning": origin.action_meaning,
+        "control_rate_hz": str(origin.fps),
+        "names": json.dumps(known),
+    }
 
 
 def _random_observations(network: MLPNetwork, checkpoint: Checkpoint) -> tuple[F32, F32, Images]:

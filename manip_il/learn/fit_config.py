@@ -185,6 +185,6 @@ class FitConfig:
 
 
 def _open(path: Path | str) -> Checkpoint:
-    from manip_il.learn.checkpoint import Checkpoint, policy_folder  # which imports numpy
+    from manip_il.learn.checkpoint import Checkpoint  # which imports numpy
 
-    return Checkpoint.open(policy_folder(path))
+    return Checkpoint.of(path)

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
-from manip_il.errors import MismatchError, NotFiniteError, UsageError
+from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.action_spaces import Conversion
 from manip_il.learn.checkpoint import CONFIG, Checkpoint, in_one_line
 from manip_il.learn.names import EE_DELTA, JOINT_TARGET, MLP
 from manip_il.learn.network import MLPNetwork, NetworkConfig, read_weights, require_device, threads
 from manip_il.learn.texts import LENGTH, tokens
-from manip_il.mdp import F32, F64, I64, Images
+from manip_il.mdp import F32, F64, I64, Images, require_finite
 
 if TYPE_CHECKING:  # `episode_policy` imports LeRobot, which takes seconds
     from manip_il.learn.episode_policy import EpisodePolicy
@@ -52,7 +52,7 @@ class LearnedPolicy:
         own factory.
 
         Args:
-            checkpoint: The checkpoint, or its `pretrained_model` folder.
+            checkpoint: The checkpoint, or the path of it or of a run.
             device: Torch's name for the device.
             task: Instruction for a policy that reads language, if `begin` gives no other.
             trust: Whether to load models and code that the checkpoint names.
@@ -64,7 +64,7 @@ class LearnedPolicy:
                 load and `trust` is not set.
         """
         require_device(device)
-        opened = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint.open(checkpoint)
+        opened = Checkpoint.of(checkpoint)
         if opened.kind == MLP:
             return cls(_Perceptron(opened, device, task), opened)
         from manip_il.learn.episode_policy import EpisodePolicy
@@ -122,9 +122,7 @@ class LearnedPolicy:
                 batch, range(len(states)) if episodes is None else episodes
             )
         found = actions.cpu().numpy().astype(np.float64)
-        if not (finite := np.isfinite(found)).all():
-            row = int(np.argmin(finite.all(axis=1)))
-            raise NotFiniteError(f"the policy's action in row {row} is not finite: {found[row]}")
+        require_finite("the policy's action", found)
         return found
 
     def begin(self, instructions: Mapping[int, str]) -> None:

@@ -7,7 +7,6 @@ step.
 Train a policy on datasets: behaviour cloning.
 """
 
-import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +31,7 @@ from lerobot.utils.random_utils import set_seed
 from manip_il.data.atomic import output_of, require_ours
 from manip_il.data.dataset import Dataset, JoinedDatasets
 from manip_il.data.lerobot_layout import EPISODE_INDEX
-from manip_il.errors import NotFiniteError, UsageError
+from manip_il.errors import NotFiniteError, UsageError, warn
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import Augment, Order, generator_of, to_float
@@ -66,7 +65,6 @@ from manip_il.option import make_options
 from manip_il.progress import Progress
 from manip_il.seeding import stream_base
 
-_LOG = logging.getLogger(__name__)
 # metrics that LeRobot's `update_policy` sets
 _METRICS = ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
@@ -129,9 +127,7 @@ class Trainer:
         self.encoder = self.conversion if in_processors else None  # else the network converts
         self.meta: Any = JoinedDatasets(datasets)
         if not language and len(self.meta.tasks) > 1:
-            _LOG.warning(
-                "%s reads no text, and the data have %d tasks", config.kind, len(self.meta.tasks)
-            )
+            warn(f"{config.kind} reads no text, and the data have {len(self.meta.tasks)} tasks")
         self.data = self.read_data(columns, on_frames)
         self.order = self.draw_order(shares, weights)
         self._augment = Augment() if config.augments else None

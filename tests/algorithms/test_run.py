@@ -245,7 +245,7 @@ def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path
     held_out = tmp_path / "held_out/dataset"
     assert held_out.is_dir() == (method == "dart")
     extra = Dataset.open(held_out).info.frames if method == "dart" else 0
-    assert results[1].metrics["queries"] == results[1].labels + extra
+    assert results[1].steps >= results[1].labels + extra
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ MISTAKES = {
     f"{TRAIN} --wandb.projekt=a --policy.type=act": "did you mean 'project'",
     f"{TRAIN} --policy.type=akt --observation=images": "unknown policy 'akt' (did you mean 'act'?)",
     "eval": "--policy.path=DIR",
-    "eval --policy.path=lerobot/act_aloha": "manip-il pull hf://lerobot/act_aloha FOLDER",
+    "eval --policy.path=lerobot/act_aloha": "manip-il pull hf://USER/NAME FOLDER",
     "eval missing --replay=1": "cannot read missing: No such file or directory; expected an eval.json",
     "eval SAMPLE": "EVALUATION and --replay=SEED belong together",
     f"{EXPERT} --suite=nominall": "did you mean 'nominal'?",

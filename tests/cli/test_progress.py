@@ -1,6 +1,8 @@
 import pytest
 
-from manip_il.cli.outputs import progress, say, set_quiet, warn
+from manip_il.cli.main import main
+from manip_il.cli.outputs import progress, say, set_quiet
+from manip_il.errors import warn
 
 
 @pytest.fixture(autouse=True)
@@ -31,6 +33,7 @@ def test_quiet_silences_progress_and_not_say(capsys):
 
 
 def test_each_warning_is_one_line(capsys):
+    main(["--help"])  # which prints warnings from here on
     warn("a joint has\nno range", "the other")
     warn()
     lines = capsys.readouterr().err.splitlines()

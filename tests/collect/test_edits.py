@@ -103,10 +103,10 @@ def test_labels_given_afterwards_elsewhere_in_another_order_are_those_given_whil
 @pytest.mark.parametrize(
     "env", [REACH, make_config("fetch_stock", "FetchReach-v4")], ids=lambda env: env.robot
 )
-def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvConfig, tmp_path):
+def test_relabelling_gives_the_labels_of_today(env: EnvConfig, tmp_path):
     [first, second] = recorded(env)
     older = {key: first.columns[key].copy() for key in (schema.ACTION, schema.EXPERT_PHASE)}
-    older[schema.ACTION][:2, 0] += np.array([0.05, 1e-5])  # the second is nothing to speak of
+    older[schema.ACTION][0, 0] += 0.05
     older[schema.EXPERT_PHASE][1] += 1
     bare = {
         key: np.zeros_like(second.columns[key])
@@ -114,9 +114,7 @@ def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvC
     }
     root = write([changed(first, **older), changed(second, **bare)], tmp_path / "older", env)
     whole = write([first, second], tmp_path / "whole", env)
-    assert relabel_dataset(open_source(root), EditTarget(tmp_path / "new", workers=2)) == 2 + len(
-        second
-    )
+    relabel_dataset(open_source(root), EditTarget(tmp_path / "new", workers=2))
     new, expected = Dataset.open(tmp_path / "new"), Dataset.open(whole)
     for key, column in expected.columns().items():
         np.testing.assert_array_equal(new.columns()[key], column)

@@ -67,7 +67,7 @@ def record(root: Path, tasks: list[str], **more: dict[str, Any]) -> Path:
 def check(root: Path, folder: Path) -> str:
     """Open, examine and train; return what the spec calls the joints."""
     dataset = Dataset.open(root)
-    assert sum(map(len, map(dataset.rows_of, range(dataset.info.episodes)))) == len(dataset)
+    assert dataset.episodes.length.sum() == len(dataset)
     assert len(dataset.columns()["action"]) == len(dataset) == dataset.info.frames
     assert [str(one) for one in examine_folder(root) if one.place != layout.STATS] == []
     policy = [
@@ -239,9 +239,7 @@ def test_joints_alone_of_any_robot_train_a_policy_that_lerobot_loads(tmp_path, s
     assert main(["train", *policy, *words]) == 0
     assert Dataset.open(tmp_path / "joints").info.robot == "my arm/v2.yaml"
     folder = tmp_path / "run/checkpoints/last/pretrained_model"
-    advice = capsys.readouterr().out.partition("no simulator of this program fits the policy: ")[2]
-    assert f"lerobot-rollout --strategy.type=base --policy.path={folder} " in advice
-    assert "manip-il eval" not in advice
+    assert "manip-il eval" not in capsys.readouterr().out
     ours = LearnedPolicy.load(folder)
     assert ours.checkpoint.numbers == {"observation.state": 3}
     assert ours.checkpoint.origin.robot == "my_arm_v2_yaml"

@@ -72,7 +72,7 @@ def test_a_batch_is_that_of_lerobots_loader(
     samples, meta = trainer.data, JoinedDatasets(sources)
     ahead = resolve_delta_timestamps(trainer.pipeline.policy, cast(Any, meta))
     lerobots: Any = LeRobotDataset(meta.repo_id, root=sources[0].root, delta_timestamps=ahead)
-    for rows in (np.array([0, 3, 20, meta.total_frames - 1]), np.array([7])):
+    for rows in (np.array([0, 3, 20, sum(map(len, sources)) - 1]), np.array([7])):
         theirs = torch.utils.data.default_collate([lerobots[int(row)] for row in rows])
         batch = samples.batch(rows)
         assert {f"{key}_is_pad" for key in batch if key in (ahead or {})} <= batch.keys()

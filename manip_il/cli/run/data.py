@@ -24,7 +24,7 @@ from manip_il.cli.data import (
     RenderOptions,
     RepairOptions,
 )
-from manip_il.cli.outputs import progress, require_writable, say, warn
+from manip_il.cli.outputs import progress, require_writable, say
 from manip_il.collect.edits import (
     CHUNK,
     EditSource,
@@ -83,7 +83,6 @@ def _open(
     folder = options.target or root.with_name(f"{root.absolute().name}_{what}")
     require_writable(folder, DATASET, options.overwrite, [root])
     source = open_source(root, options.robot, options.task, options.object)
-    warn(*source.warnings)
     with exclusive(folder), progress(pieces or source.dataset.info.episodes, str(folder)) as bar:
         yield (
             source,
@@ -102,11 +101,8 @@ def run_render(options: RenderOptions) -> None:
 def run_relabel(options: RelabelOptions) -> None:
     """Label every state; TARGET appears when it is complete."""
     with _open(options, "relabelled") as (source, target):
-        changed, info = relabel_dataset(source, target), source.dataset.info
-        say(
-            f"relabelled {info.episodes:,} episodes, {info.frames:,} frames: {changed:,} labels"
-            " differ"
-        )
+        info = relabel_dataset(source, target)
+        say(f"relabelled {info.episodes:,} episodes, {info.frames:,} frames")
 
 
 def run_annotate(options: AnnotateOptions) -> None:

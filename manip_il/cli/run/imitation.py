@@ -7,26 +7,25 @@ Run `manip-il compare`: two policies or runs on the same seeds, or a study.
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 from manip_il import checks
 from manip_il.algorithms.config import ALGORITHMS, RunConfig, check_labels
-from manip_il.algorithms.imitation import check_inputs, dagger
+from manip_il.algorithms.imitation import check_inputs, dagger, run_config
 from manip_il.algorithms.results import best_result, validation_report
 from manip_il.algorithms.run import Run
 from manip_il.cli.common_options import EngineOptions
 from manip_il.cli.evaluate import CompareOptions, ComparisonOptions, StudyFile
 from manip_il.cli.imitation import DaggerOptions, DemoOptions
-from manip_il.cli.outputs import Stages, about, publish, say, say_next, warn
-from manip_il.cli.parsing import Open, from_layers, from_yaml
+from manip_il.cli.outputs import Stages, about, publish, say, say_next
+from manip_il.cli.parsing import from_layers, from_yaml
 from manip_il.collect.inputs import env_config, path_options
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.query import parse_query
 from manip_il.collect.workers import Engine
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.errors import ManipError, UnknownName, UsageError, warn
 from manip_il.evaluation.comparison import FILE_NAME, Comparison, Study
 from manip_il.evaluation.eval_report import compare_report, run_report, success_table
 from manip_il.evaluation.film import collect_films, film_episode, run_states
@@ -43,10 +42,9 @@ from manip_il.evaluation.side import (
     select_rounds,
 )
 from manip_il.evaluation.suites import varied
-from manip_il.learn.checkpoint import Checkpoint, policy_folder
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.names import MLP
-from manip_il.learn.network import NetworkConfig
+from manip_il.learn.names import CNN
 from manip_il.worlds.config import EnvConfig
 
 
@@ -87,44 +85,24 @@ def say_best(folder: Path, words: Sequence[str] = ()) -> None:
 
 def dagger_config(options: DaggerOptions) -> RunConfig:
     """Return the configuration of the run; raises if options contradict each other."""
-    policy, start = round_policy(options.fit.get("policy", {}))
-    observation, env = options.fit.get("observation"), env_config(options.env)
-    sees = policy.get("type") == "cnn" and observation != "state"
-    cameras = options.camera_config(env) if options.cameras or sees else None
-    if start is not None:
-        observation, cameras = observation or start.observation, cameras or start.cameras
-    return RunConfig(
-        env=env,
+    env = env_config(options.env)
+    fit = FitConfig(**options.fit, trust=options.trust)
+    sees = fit.start is None and fit.kind == CNN and fit.takes_images
+    if options.cameras or sees:
+        cameras = options.camera_config(env)
+    else:
+        cameras = fit.start and fit.start.cameras
+    return run_config(
+        env,
+        query=options.query,
         method=options.method,
         conditions=varied(options.vary, env, sees=cameras is not None),
-        fit=FitConfig(
-            **dict(options.fit, policy=policy, observation=observation, trust=options.trust)
-        ),
+        fit=fit,
         cameras=cameras,
         datasets=tuple(options.dataset.root),
-        start=start and start.path,
-        query_rule=None if options.query is None else parse_query(options.query),
+        start=fit.start and fit.start.path,
         **options.settings,
     )
-
-
-def round_policy(settings: Open) -> tuple[Open, Checkpoint | None]:
-    """Return the policy options for fits, and the checkpoint to start from, if any.
-
-    For an mlp, the options stored in the checkpoint replace the key `path`: they are needed before
-    LeRobot is imported.
-    """
-    if "path" not in settings:
-        return settings, None
-    start = Checkpoint.open(policy_folder(settings["path"]))
-    if start.kind != MLP:
-        return settings, start
-    if "type" in settings:
-        raise UsageError(
-            "give one of --policy.path=DIR and --policy.type=...: the checkpoint sets the type"
-        )
-    options = {"type": MLP} | asdict(NetworkConfig.of(start.config))
-    return options | {name: value for name, value in settings.items() if name != "path"}, start
 
 
 ENOUGH = 1.25  # demonstrations to record, relative to the number that should give enough labels

@@ -9,10 +9,10 @@ import os
 from manip_il.cli.imitation import RANK, TrainOptions
 from manip_il.cli.outputs import Stages, say, say_next, set_quiet
 from manip_il.cli.transfer import ExportOptions
-from manip_il.collect.inputs import open_dataset, why_not_simulated
+from manip_il.collect.inputs import open_dataset
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError
-from manip_il.learn.checkpoint import find_policy, read_config
+from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.export import export_onnx
 from manip_il.learn.train import train
 
@@ -42,19 +42,8 @@ def run_train(options: TrainOptions) -> None:
         return
     say(f"checkpoint: {policy.path}")
     [first, *_] = datasets
-    path = f"--policy.path={policy.path}"
-    if first.own is None and (reason := why_not_simulated(policy)):
-        say(f"no simulator of this program fits the policy: {reason}")
-        words = "--policy.discover_packages_path=manip_il.lerobot_plugin", f"--fps={first.spec.fps}"
-        say_next(
-            "--strategy.type=base",
-            path,
-            *words,
-            what="next, on its robot",
-            program="lerobot-rollout",
-        )
-    else:
-        say_next("eval", path, f"--output_dir={folder}/eval")
+    if first.own is not None:
+        say_next("eval", f"--policy.path={policy.path}", f"--output_dir={folder}/eval")
 
 
 EXPORTABLE = ("mlp", "cnn")
@@ -63,13 +52,15 @@ EXPORTABLE = ("mlp", "cnn")
 def run_export(options: ExportOptions) -> None:
     """Export, compare, write."""
     options.check()
-    path = find_policy(options.policy)
-    if (kind := read_config(path)["type"]) not in EXPORTABLE:
+    policy = Checkpoint.of(options.policy)
+    path = policy.path
+    if policy.kind not in EXPORTABLE:
         raise ManipError(
-            f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported"
+            f"{path} is a policy of type {policy.kind!r}; only {' and '.join(EXPORTABLE)} can be"
+            " exported"
         )
     try:
-        content, difference = export_onnx(path)
+        content, difference = export_onnx(policy)
     except ImportError as error:
         raise ManipError(
             f"an ONNX file needs {error.name}: pip install 'manip_il[export]'"
