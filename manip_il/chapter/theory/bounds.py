@@ -241,9 +241,7 @@ def clone(process: Process, seen: NDArray[np.bool_]) -> F64:
     return np.where(seen | (process.wrong_costs(seen.shape[-2]) <= 0), 0.0, 1.0)
 
 
-def dagger(
-    process: Process, seen: NDArray[np.bool_], count: int, rng: np.random.Generator
-) -> F64:
+def dagger(process: Process, seen: NDArray[np.bool_], count: int, rng: np.random.Generator) -> F64:
     """Return DAgger's policies.
 
     Each is the policy of the round with the fewest errors in its own states (Definition 8.2).
