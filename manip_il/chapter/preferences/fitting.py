@@ -29,7 +29,6 @@ from manip_il.learn.batches import generator_of
 from manip_il.learn.network import threads
 from manip_il.mdp import F64, I64
 
-TIE = 0.01  # if the clips' mean progress differs by less, neither is better
 BY_CHANCE = 0.1  # E, the share of random answers
 _LR = 1e-4
 _WEIGHT_DECAY = 1.0
@@ -51,20 +50,17 @@ class FittedReward:
         logits: R(left) - R(right) of every answer, by the network that held it out, (A,).
         epochs: Number of epochs that the networks were trained for.
         answered: Agreement with the answers that are not `equal`.
-        true: Agreement with true progress, without pairs that differ by less than `TIE`.
     """
 
     network: RewardNetwork
     logits: F64
     epochs: int
     answered: Proportion
-    true: Proportion
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of `fit.json`."""
         return {
             "agreement_with_answers": _counts(self.answered),
-            "agreement_with_progress": _counts(self.true),
             "epochs": self.epochs,
         }
 
@@ -110,17 +106,8 @@ def fit_answers(
         network.low.fill_(low)
         network.high.fill_(max(high, low + 1e-6))
     right = (logits > 0) == (answers.better > 0.5)
-    pairs, first = np.unique(answers.pair, return_index=True)
-    difference = true_difference(clips)[pairs]
-    true = ((logits[first] > 0) == (difference > 0))[np.abs(difference) >= TIE]
     answered = _proportion(right[answers.better != 0.5])
-    return FittedReward(network, logits, epochs, answered, _proportion(true))
-
-
-def true_difference(clips: Clips) -> F64:
-    """Return the mean true progress of each left clip minus that of the right one, (P,)."""
-    means = clips.data.progress[clips.rows].mean(axis=-1)
-    return means[:, 0] - means[:, 1]
+    return FittedReward(network, logits, epochs, answered)
 
 
 def summary_lines(found: FittedReward, answers: Answers) -> list[str]:
@@ -129,7 +116,6 @@ def summary_lines(found: FittedReward, answers: Answers) -> list[str]:
     return [
         f"{given}, {answers.skipped:,} skipped",
         f"agreement with answers on held-out pairs: {found.answered}",
-        f"agreement with true progress on held-out pairs: {found.true} of {found.true.n:,}",
     ]
 
 

@@ -231,5 +231,3 @@ def _arm(shift: Shift) -> list[Section]:
             ),
         ),
     ]
-
-
