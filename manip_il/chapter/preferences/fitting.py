@@ -98,7 +98,7 @@ def fit_answers(
         network.std.copy_(features.std(0).clamp(min=1e-6))
         epochs = _train(network, inputs, sides, answers.better, folds, seed, on_epoch)
         with torch.no_grad():
-            every = _logits(network, inputs, sides).numpy().astype(np.float64)
+            every = network.logits(inputs, sides).numpy().astype(np.float64)
             logits = every[folds, np.arange(len(folds))]
             rewards = torch.cat([network.members(part).mean(0) for part in inputs.split(_ROWS)])
             some = rewards[:: max(1, len(rewards) // _MOST_FRAMES)]
@@ -177,14 +177,14 @@ def _train(
     generator = generator_of(seed, 1)
     for epoch in range(1, _EPOCHS + 1):
         for rows in torch.randperm(len(better), generator=generator).split(_BATCH):
-            losses = answer_losses(_logits(network, inputs, sides[rows]), better[rows])
+            losses = answer_losses(network.logits(inputs, sides[rows]), better[rows])
             optimizer.zero_grad(set_to_none=True)
             (
                 (losses * learns[:, rows]).sum(1) / learns[:, rows].sum(1).clamp(min=1)
             ).sum().backward()
             optimizer.step()
         with torch.no_grad():
-            losses = answer_losses(_logits(network, inputs, sides), better)
+            losses = answer_losses(network.logits(inputs, sides), better)
         on_epoch()
         if (loss := losses[left_out].mean().item()) < lowest:
             lowest, best = loss, epoch
@@ -193,17 +193,6 @@ def _train(
             break
     network.load_state_dict(kept)
     return best
-
-
-def _logits(network: RewardNetwork, inputs: Tensor, sides: Tensor) -> Tensor:
-    """R(left) - R(right) for every network, (M, A). sides: rows of `inputs` of both clips, (A,
-    2, L).
-    """
-    rows = [sides[:, side] for side in (0, 1)]
-    left, right = (
-        network.members(inputs[one.reshape(-1)]).view(-1, *one.shape).sum(-1) for one in rows
-    )
-    return left - right
 
 
 def _proportion(right: NDArray[np.bool_]) -> Proportion:
