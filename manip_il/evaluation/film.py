@@ -3,7 +3,6 @@
 import io
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import av
 import numpy as np
@@ -16,7 +15,7 @@ from manip_il.data import schema
 from manip_il.errors import RenderError
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.results import EvalResult
-from manip_il.mdp import Episode
+from manip_il.mdp import F64, Episode
 from manip_il.progress import Progress
 from manip_il.sim.config import FILM, CameraConfig
 from manip_il.worlds.config import EnvConfig
@@ -28,11 +27,24 @@ _SIZE = (240, 320)  # height and width [pixels]
 _LOG = logging.getLogger(__name__)
 
 
-def run_states(job: RolloutJob, seed: int) -> Episode:
-    """Return the episode of one seed with its states, identical to that in an evaluation of
-    `job`.
+def film_states(env: EnvConfig, states: F64, every: int, size: tuple[int, int] = _SIZE) -> bytes:
+    """Return an MP4 of an environment's states, in real time.
+
+    Args:
+        env: The environment, filmed by the first of its default cameras.
+        states: States of consecutive control steps, rows of `sim_state`, (N, m).
+        every: Control steps per frame of film.
+        size: Height and width [pixels].
+
+    Raises:
+        RenderError: if there is no off-screen OpenGL.
+        Unable: if the environment cannot be drawn.
     """
-    return next(replace(job, label="last").run([seed]))
+    spec = env_spec(env)
+    spec.require("drawn", "there is no film of it")
+    camera = spec.default_cameras[0]
+    pictures = render_states(env, CameraConfig((camera,), *size, FILM), states[::every])
+    return encode_mp4(list(pictures[schema.IMAGES + camera]), env.control_hz / every)
 
 
 def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str = "") -> Film:
@@ -48,13 +60,7 @@ def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str
         RenderError: if there is no off-screen OpenGL.
         Unable: if the environment cannot be drawn.
     """
-    states = episode.columns[schema.SIM_STATE][::FILM_EVERY]
-    spec = env_spec(env)
-    spec.require("drawn", "there is no film of it")
-    camera = spec.default_cameras[0]
-    pictures = render_states(env, CameraConfig((camera,), *_SIZE, FILM), states)
-    frames = list(pictures[schema.IMAGES + camera])
-    return Film(title, encode_mp4(frames, env.control_hz / FILM_EVERY), caption)
+    return Film(title, film_states(env, episode.columns[schema.SIM_STATE], FILM_EVERY), caption)
 
 
 def collect_films(made: Iterable[Film], progress: Progress) -> list[Film]:
