@@ -3,6 +3,7 @@
 import io
 import logging
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import av
 import numpy as np
@@ -15,7 +16,7 @@ from manip_il.data import schema
 from manip_il.errors import RenderError
 from manip_il.evaluation.report import Film
 from manip_il.evaluation.results import EvalResult
-from manip_il.mdp import F64, Episode
+from manip_il.mdp import Episode
 from manip_il.progress import Progress
 from manip_il.sim.config import FILM, CameraConfig
 from manip_il.worlds.config import EnvConfig
@@ -27,7 +28,9 @@ _SIZE = (240, 320)  # height and width [pixels]
 _LOG = logging.getLogger(__name__)
 
 
-def film_states(env: EnvConfig, states: F64, every: int, size: tuple[int, int] = _SIZE) -> bytes:
+def film_states(
+    env: EnvConfig, states: NDArray[Any], every: int, size: tuple[int, int] = _SIZE
+) -> bytes:
     """Return an MP4 of an environment's states, in real time.
 
     Args:

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from manip_il.chapter.preferences.pairs import Answers, Clips
@@ -59,10 +58,13 @@ class FittedReward:
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of `fit.json`."""
-        return {
-            "agreement_with_answers": _counts(self.answered),
-            "epochs": self.epochs,
+        right = {
+            "rate": self.answered.rate,
+            "interval": list(self.answered.interval),
+            "right": self.answered.successes,
+            "of": self.answered.n,
         }
+        return {"agreement_with_answers": right, "epochs": self.epochs}
 
 
 def fit_answers(
@@ -105,8 +107,8 @@ def fit_answers(
             low, high = torch.quantile(some, torch.tensor(_RANGE)).tolist()
         network.low.fill_(low)
         network.high.fill_(max(high, low + 1e-6))
-    right = (logits > 0) == (answers.better > 0.5)
-    answered = _proportion(right[answers.better != 0.5])
+    right = ((logits > 0) == (answers.better > 0.5))[answers.better != 0.5]
+    answered = Proportion(int(right.sum()), max(len(right), 1))
     return FittedReward(network, logits, epochs, answered)
 
 
@@ -193,11 +195,3 @@ def _train(
             break
     network.load_state_dict(kept)
     return best
-
-
-def _proportion(right: NDArray[np.bool_]) -> Proportion:
-    return Proportion(int(right.sum()), max(len(right), 1))
-
-
-def _counts(one: Proportion) -> dict[str, Any]:
-    return {"rate": one.rate, "interval": list(one.interval), "right": one.successes, "of": one.n}
