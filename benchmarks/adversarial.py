@@ -32,15 +32,14 @@ from scipy.stats import trim_mean
 
 from manip_il.chapter.config import DiscriminatorConfig, PPOConfig
 from manip_il.chapter.discriminators import Discriminator
-from manip_il.chapter.episodes import ActionRange, Demonstrations, Lockstep
-from manip_il.chapter.learning import airl, gail
+from manip_il.chapter.episodes import Demonstrations, Lockstep
+from manip_il.chapter.learning import imitate
 from manip_il.chapter.ppo import Learner, seed_generators
 from manip_il.learn.network import MLPNetwork, NetworkConfig, fit_statistics, threads
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 Acting = Callable[[F32], F32]  # raw inputs (B, d) to raw targets (B, 1)
-LOOPS: dict[str, Callable[..., Iterator[Any]]] = {"gail": gail, "airl": airl}
 LIMITS = {"gail": 0.95, "airl": 0.90}
 # Pendulum-v1's [N m], [m/s^2]; angle at which the expert balances [rad]
 _TORQUE, _GRAVITY, _TOP = 2.0, 10.0, 0.5
@@ -162,25 +161,24 @@ _QUICK = {"steps": 1_000, "episode_steps": 20, "demonstrations": 2}
 
 
 class Run:
-    """The steps that `gail` and `airl` call, as in `Agent`, with nothing on disk."""
+    """The steps that `imitate` calls, as in `Agent`, with nothing on disk."""
 
-    def __init__(self, name: str, settings: Settings, seed: int):
+    def __init__(self, algorithm: str, name: str, settings: Settings, seed: int):
+        self._gamma = settings.discount if algorithm == "airl" else None
         self.simulated, self.metrics = 0, dict[str, float]()
         self._settings, self._seed, self._number = settings, seed, 0
         shown = demonstrations(name, settings, seed)
         seed_generators(self._stream("weights"))
         self._network = MLPNetwork(shown.inputs[0].shape[1], 1, SHAPE)
         self._network.set_statistics(fit_statistics(*shown.stacked, SHAPE.loss))
-        names = ("target_mean", "target_scale", "target_low", "target_high")
-        actions = ActionRange(*(getattr(self._network, one).numpy().copy() for one in names))
         episodes = [ENVIRONMENTS[name]() for _ in range(settings.episodes)]
-        self._envs = Lockstep(episodes, actions, settings.episode_steps)
+        self._envs = Lockstep(episodes, self._network, settings.episode_steps)
         self._learner = Learner(self._network, settings.ppo, self._envs, settings.log_std)
-        self._expert = shown.padded(settings.episode_steps, actions.normalised)
+        self._expert = shown.padded(settings.episode_steps, self._network)
 
-    def discriminator(self, gamma: float | None = None) -> Discriminator:
+    def discriminator(self) -> Discriminator:
         seed_generators(self._stream("discriminator"))
-        return Discriminator(self._settings.discriminator, self._network, gamma)
+        return Discriminator(self._settings.discriminator, self._network, self._gamma)
 
     def agent(self) -> Run:
         return self
@@ -231,7 +229,7 @@ def main() -> int:
     )
     parser.add_argument("--seeds", type=int, default=10, help="training seeds, from 0 on")
     parser.add_argument("--env", choices=[*ENVIRONMENTS], help="by default both")
-    parser.add_argument("--algorithm", choices=[*LOOPS], help="by default both")
+    parser.add_argument("--algorithm", choices=[*LIMITS], help="by default both")
     parser.add_argument(
         "--quick", action="store_true", help="a few of each: shows that it runs, measures nothing"
     )
@@ -245,7 +243,7 @@ def main() -> int:
         ends = {name: references(name, options.quick) for name in names}
         missed = [
             measure(algorithm, ends, seeds, quick=options.quick)
-            for algorithm in ([options.algorithm] if options.algorithm else LOOPS)
+            for algorithm in ([options.algorithm] if options.algorithm else LIMITS)
         ]
     return int(any(missed) and not options.quick)
 
@@ -296,8 +294,9 @@ def _missed(algorithm: str, name: str, shares: Sequence[float]) -> bool:
 
 def trained(algorithm: str, name: str, settings: Settings, seed: int) -> Acting:
     """Return the last policy of a run, acting without exploration."""
-    run = Run(name, settings, seed)
-    for _ in LOOPS[algorithm](run, settings):
+    run: Any = Run(algorithm, name, settings, seed)
+    options: Any = settings
+    for _ in imitate(run, options):
         pass
     return run.acts
 

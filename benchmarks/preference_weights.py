@@ -26,7 +26,6 @@ from pathlib import Path
 import numpy as np
 from _machine import describe_machine
 
-from manip_il.chapter.preferences.fitting import TIE, true_difference
 from manip_il.chapter.preferences.pairs import choose_pairs, find_datasets
 from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.main import main as manip_il
@@ -42,6 +41,7 @@ from manip_il.learn.training_state import PRETRAINED_MODEL
 
 AGREEMENT, AREA, POINTS, P_VALUE = 0.90, 0.95, 0.15, 0.001
 _FRESH, _CLIP, _DRAWS = 2_000, 20, 5
+_TIE = 0.01  # if the clips' mean progress differs by less, neither is better
 
 
 def main() -> int:
@@ -95,10 +95,7 @@ def measure(folder: Path, task: str, *, quick: bool) -> int:
     join(folder / "good", folder / "bad" / "round_001" / "dataset", half)
     run(f"data score {half} --reward={rewards[0]}", folder / "scores")
     run(f"data score {half} --reward=progress", folder / "true_scores")
-    area, true = (
-        json.loads((folder / name / "scores.json").read_text())["auc"]
-        for name in ("scores", "true_scores")
-    )
+    area, true = (roc_auc(folder / name / "scores.json") for name in ("scores", "true_scores"))
     weights = f"--weights={folder / 'scores' / 'rabc.parquet'}"
     sources = {
         "weighted": f"{half} {weights}",
@@ -115,7 +112,7 @@ def measure(folder: Path, task: str, *, quick: bool) -> int:
     print(f"weighted against as it is: {compared.verdict}")
     reached = (
         agreement >= AGREEMENT,
-        (area or 0) >= AREA,
+        area >= AREA,
         compared.difference >= POINTS and compared.p_value < P_VALUE,
     )
     return 0 if quick or all(reached) else 1
@@ -162,9 +159,26 @@ def fresh_agreement(rounds: Path, reward: Path, count: int) -> Proportion:
     """
     clips = choose_pairs(find_datasets([rounds]), _CLIP, count, 0, np.random.default_rng(999))
     returns = LearnedReward.load(reward / PRETRAINED_MODEL)(clips.data.inputs)[clips.rows].sum(-1)
-    difference = true_difference(clips)
-    told = np.abs(difference) >= TIE
+    means = clips.data.progress[clips.rows].mean(axis=-1)
+    difference = means[:, 0] - means[:, 1]
+    told = np.abs(difference) >= _TIE
     return Proportion.of((((returns[:, 0] - returns[:, 1]) > 0) == (difference > 0))[told].tolist())
+
+
+def roc_auc(scores: Path) -> float:
+    """Return the share of pairs of a failed and a successful episode in which the failed one has
+    the lower score; equal scores count half.
+
+    This is the area under the ROC curve for detecting failed episodes by a low score (Mann and
+    Whitney 1947).
+    """
+    episodes = json.loads(scores.read_text())["episodes"]
+    good, bad = (
+        np.array([one["score"] for one in episodes if one["success"] == success])
+        for success in (True, False)
+    )
+    above = good[:, None] - bad
+    return float(((above > 0) + 0.5 * (above == 0)).mean())
 
 
 def join(good: Path, bad: Path, target: Path) -> None:

@@ -33,11 +33,8 @@ Batch = tuple[Tensor, ...]  # states (B, e), actions (B, n), next states (B, e),
 
 
 class Discriminator(nn.Module):
-    """A discriminator, its optimiser and its input scales."""
+    """A discriminator and its optimiser."""
 
-    mean: Tensor
-    scale: Tensor
-    clamp: Tensor
     free: Tensor
 
     def __init__(
@@ -47,16 +44,14 @@ class Discriminator(nn.Module):
 
         Args:
             config: Its sizes and the options of its optimiser.
-            network: The actor, whose statistics scale the inputs.
+            network: The actor, which normalises the inputs.
             gamma: Discount per control step in AIRL's f; None for GAIL's form.
         """
         super().__init__()
         self.config = config
-        for name, value in (("mean", network.input_mean), ("scale", network.input_scale)):
-            self.register_buffer(name, value[: network.inputs].clone())
-        self.register_buffer("clamp", torch.tensor(network.clamp))
+        self._normalise = network.encode
         self.register_buffer("free", (network.target_scale > 0).float())
-        encoded = len(self.mean) + 1
+        encoded = len(network.input_mean) + 1
         self.g = perceptron(encoded + len(self.free), config.width, 2, 1, nn.ReLU)
         self.h = None if gamma is None else perceptron(encoded, config.width, 2, 1, nn.ReLU)
         self._gamma = gamma or 0.0
@@ -143,9 +138,8 @@ class Discriminator(nn.Module):
         return self._state(rows.states), actions, self._state(rows.next_states), log_prob
 
     def _state(self, states: F32) -> Tensor:
-        given = torch.from_numpy(states)
-        x, absorbing = (given[:, :-1] - self.mean) * self.scale, given[:, -1:]
-        return torch.cat([x.clamp(-self.clamp, self.clamp) * (1.0 - absorbing), absorbing], dim=1)
+        inputs, absorbing = torch.from_numpy(states).tensor_split([-1], dim=1)
+        return torch.cat([self._normalise(inputs) * (1.0 - absorbing), absorbing], dim=1)
 
 
 def _drawn(data: Batch, count: int, rng: np.random.Generator) -> Batch:

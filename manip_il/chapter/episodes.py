@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from manip_il.data.dataset import joined_columns
@@ -86,12 +87,12 @@ class Demonstrations:
         """Return all inputs (N, d) and targets (N, n), raw."""
         return np.concatenate(self.inputs), np.concatenate(self.targets)
 
-    def padded(self, steps: int, encode: Callable[[F32], F32]) -> Transitions:
+    def padded(self, steps: int, network: MLPNetwork) -> Transitions:
         """Return all episodes, each padded to `steps` transitions, or not padded if `hold` is None.
 
         Args:
             steps: Transitions of a padded episode.
-            encode: Normalises raw targets (T, n).
+            network: The policy, which normalises the targets within its range.
 
         Raises:
             UsageError: If an episode is longer than `steps`.
@@ -106,7 +107,8 @@ class Demonstrations:
             more = 0 if self.hold is None else max(1, steps - len(inputs) + 1)
             states = np.pad(inputs, ((0, more), (0, 1)))
             states[len(inputs) :, -1] = 1.0
-            actions = np.pad(encode(targets), ((0, more), (0, 0)))
+            within = torch.from_numpy(targets).clamp(network.target_low, network.target_high)
+            actions = np.pad(network.encode_targets(within).numpy(), ((0, more), (0, 0)))
             made.append((states[:-1], actions[:-1], states[1:]))
         return Transitions(*(np.concatenate(parts) for parts in zip(*made, strict=True)))
 
@@ -193,48 +195,6 @@ class RobotEpisode:
         return self._held > 0
 
 
-@dataclass(frozen=True)
-class ActionRange:
-    """Mean, scale and range of raw targets.
-
-    A normalised action y is converted to the target mean + scale y, clipped to the range.
-
-    Attributes:
-        mean: Mean, (n,).
-        scale: Scale, (n,).
-        low: Lower end of the range, (n,).
-        high: Upper end of the range, (n,).
-    """
-
-    mean: F32
-    scale: F32
-    low: F32
-    high: F32
-
-    @classmethod
-    def of(cls, network: MLPNetwork) -> ActionRange:
-        """Return the scale and range of a network's targets."""
-        names = ("target_mean", "target_scale", "target_low", "target_high")
-        return cls(*(getattr(network, name).numpy().copy() for name in names))
-
-    def raw(self, actions: F32) -> F32:
-        """Return the raw targets (B, n) for normalised actions (B, n)."""
-        return np.clip(actions * self.scale + self.mean, self.low, self.high).astype(np.float32)
-
-    def normalised(self, targets: F32) -> F32:
-        """Return the normalised actions (B, n) for raw targets (B, n).
-
-        0 for a target that never changes.
-        """
-        offsets = np.clip(targets, self.low, self.high) - self.mean
-        found = np.divide(offsets, self.scale, out=np.zeros_like(offsets), where=self.scale > 0)
-        return found.astype(np.float32)
-
-    def clip(self, actions: F32) -> F32:
-        """Return normalised actions (B, n) within the range."""
-        return np.clip(actions, self.normalised(self.low), self.normalised(self.high))
-
-
 class Lockstep:
     """B episodes of equal length, run in lockstep.
 
@@ -251,7 +211,7 @@ class Lockstep:
     def __init__(
         self,
         episodes: Sequence[Any],
-        actions: ActionRange,
+        network: MLPNetwork,
         horizon: int,
         conversion: Conversion | None = None,
     ):
@@ -259,13 +219,13 @@ class Lockstep:
 
         Args:
             episodes: Each a `RobotEpisode`, or an object with its methods.
-            actions: Range of the policy's targets.
+            network: The policy, which turns normalised actions into raw targets.
             horizon: Control steps of every episode.
             conversion: Turns the policy's raw targets into actions, given the measured joints (the
                 first inputs).
         """
         self.episodes = episodes
-        self.range = actions
+        self._network = network
         self.horizon = horizon
         self._conversion = conversion or Conversion()
         self.simulated = 0
@@ -292,7 +252,7 @@ class Lockstep:
 
         Return observations (B, d + 2).
         """
-        targets = self.range.raw(actions)
+        targets = self._network.decode_targets(torch.from_numpy(actions)).numpy()
         running = [row for row, episode in enumerate(self.episodes) if not episode.ended]
         executed = np.zeros(targets.shape)
         if running:

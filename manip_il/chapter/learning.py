@@ -24,7 +24,6 @@ from manip_il.algorithms.run import Run
 from manip_il.chapter.config import LONGER, LearningConfig
 from manip_il.chapter.discriminators import Discriminator
 from manip_il.chapter.episodes import (
-    ActionRange,
     Lockstep,
     RobotEpisode,
     read_demonstrations,
@@ -51,28 +50,23 @@ from manip_il.seeding import rng_for, stream_base, stream_seeds
 from manip_il.worlds.table import env_fingerprint, env_spec
 
 
-def gail(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
-    """Yield each iteration's result of generative adversarial imitation learning (Ho & Ermon,
-    NeurIPS 2016, algorithm 1), with PPO as its policy step.
-    """
-    return _imitate(run, c, None)
-
-
-def airl(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
-    """Yield each iteration's result of adversarial inverse reinforcement learning (Fu, Luo &
-    Levine, ICLR 2018, algorithm 1), with PPO as its policy step.
-
-    The discriminator is D = exp f / (exp f + pi), with the learner's density pi.
-    """
-    return _imitate(run, c, c.discount)
-
-
-def _imitate(run: LearningRun, c: LearningConfig, gamma: float | None) -> Iterator[Result]:
+def imitate(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
     """Roll out the agent, fit the discriminator, and use its reward to improve the agent, again
     and again.
+
+    This is generative adversarial imitation learning (Ho & Ermon, NeurIPS 2016, algorithm 1) or
+    adversarial inverse reinforcement learning (Fu, Luo & Levine, ICLR 2018, algorithm 1), by the
+    form of the run's discriminator, with PPO as its policy step.
+
+    Args:
+        run: The run, which makes the agent and validates it.
+        c: Options of the run.
+
+    Yields:
+        The result of each iteration.
     """
     agent = run.agent()
-    d = agent.discriminator(gamma)
+    d = agent.discriminator()
     yield from run.begin(agent)
     while agent.simulated < c.steps:
         agent.rollouts()
@@ -105,7 +99,7 @@ def ppo(
         yield run.finish(agent)
 
 
-METHODS = {"gail": gail, "airl": airl, "ppo": ppo}
+METHODS = {"gail": imitate, "airl": imitate, "ppo": ppo}
 
 
 class LearningRun(Run):
@@ -213,20 +207,18 @@ class Agent:
         with threads(1):
             seed_generators(self._stream("weights"))
             self._policy = start_policy(start, self._conversion, self._spec, rows)
-            actions = ActionRange.of(self._policy.model)
             episodes = [RobotEpisode(config.env, hold) for _ in range(config.episodes)]
-            self.envs = Lockstep(episodes, actions, horizon, self._conversion)
+            self.envs = Lockstep(episodes, self._policy.model, horizon, self._conversion)
             log_std, clone = config.first_log_std, start is not None
             self._learner = Learner(self._policy.model, config.ppo, self.envs, log_std, clone=clone)
-        self._expert = shown.padded(horizon, actions.normalised) if shown else None
+        self._expert = shown.padded(horizon, self._policy.model) if shown else None
 
-    def discriminator(self, gamma: float | None = None) -> Discriminator:
-        """Return an untrained discriminator.
-
-        Args:
-            gamma: Discount per control step in AIRL's f; None for GAIL's form.
+    def discriminator(self) -> Discriminator:
+        """Return an untrained discriminator, of AIRL's form if the method is `airl`, else of
+        GAIL's.
         """
         seed_generators(self._stream("discriminator"))
+        gamma = self.config.discount if self.config.method == "airl" else None
         return Discriminator(self.config.discriminator, self._policy.model, gamma)
 
     def rollouts(self) -> None:

@@ -200,6 +200,8 @@ class Learner:
             self.policy.head.raw_log_std.fill_(raw)
             spread = floored_log_std(self.policy.head.raw_log_std).exp() * self.policy.free
         self._first_spread = spread.numpy()
+        ends = (network.target_low, network.target_high)
+        self._range = [network.encode_targets(end).numpy() for end in ends]  # lowest, highest
 
     @torch.no_grad()
     def collect(self, seed: int) -> Transitions:
@@ -220,7 +222,7 @@ class Learner:
             actions = self.policy.gaussian(obs).sample()
             values, (log_prob, _) = self.policy.values(obs), self.policy.log_prob(obs, actions)
             buffer.add(seen, actions.numpy(), nothing, nothing + (step == 0), values, log_prob)
-            seen = env.step(env.range.clip(actions.numpy()))
+            seen = env.step(np.clip(actions.numpy(), *self._range))
         after = np.concatenate([buffer.observations[1:], seen[None]])
         states, next_states = (
             rows[..., :-1].reshape(-1, rows.shape[-1] - 1) for rows in (buffer.observations, after)
@@ -275,7 +277,7 @@ class Learner:
 
     def _clipped(self, rows: Transitions) -> Transitions:
         """The rows, with actions clipped to their range, and 0 in the absorbing state."""
-        actions = self.env.range.clip(rows.actions) * (1.0 - rows.states[:, -1:])
+        actions = np.clip(rows.actions, *self._range) * (1.0 - rows.states[:, -1:])
         return Transitions(rows.states, actions.astype(np.float32), rows.next_states)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, override
@@ -27,11 +27,11 @@ from manip_il.learn.checkpoint import (
     read_origin,
 )
 from manip_il.learn.network import read_weights, threads
-from manip_il.mdp import F32, F64
+from manip_il.mdp import F32, F64, I64
 from manip_il.worlds.contract import EnvironmentSpec
 
 PREFERENCE = "preference"  # type of a learnt reward in config.json
-_ROWS = 16_384  # rows evaluated at a time
+_ROWS, _PAIRS = 16_384, 256  # rows and pairs of clips that are evaluated at a time
 
 
 @dataclass(frozen=True)
@@ -160,6 +160,19 @@ class RewardNetwork(nn.Module):
                 hidden = nn.functional.silu(hidden)
         return hidden.squeeze(-1)
 
+    def logits(self, inputs: Tensor, sides: Tensor) -> Tensor:
+        """Return R(left) - R(right) of A pairs of clips for every network, (M, A).
+
+        Args:
+            inputs: Inputs of all frames, (N, d).
+            sides: Rows of `inputs` of the left and right clips, (A, 2, L).
+        """
+        rows = [sides[:, side] for side in (0, 1)]
+        left, right = (
+            self.members(inputs[one.reshape(-1)]).view(-1, *one.shape).sum(-1) for one in rows
+        )
+        return left - right
+
     @override
     def forward(self, inputs: Tensor) -> Tensor:
         """Return the mean of the M rewards, (B,), for inputs (B, d), scaled to be 0 at `low` and
@@ -213,21 +226,22 @@ class LearnedReward:
         """Return every row's reward, (B,), for rows of state, environment state and absolute
         action, (B, n + k + n).
         """
-        return self._evaluate(self.network, inputs)
+        with threads(1), torch.inference_mode():
+            parts = torch.from_numpy(inputs).split(_ROWS)
+            return np.concatenate([self.network(part).numpy() for part in parts])
 
-    def members(self, inputs: F32) -> F64:
-        """Return every network's reward in log-odds per step, (M, B).
+    def logits(self, inputs: F32, sides: I64) -> F64:
+        """Return R(left) - R(right) of A pairs of clips for every network, (M, A).
 
         Args:
-            inputs: Rows of state, environment state and absolute action, (B, n + k + n).
+            inputs: Rows of state, environment state and absolute action, (N, n + k + n).
+            sides: Rows of `inputs` of the left and right clips, (A, 2, L).
         """
-        return self._evaluate(self.network.members, inputs).astype(np.float64)
-
-    @torch.inference_mode()
-    def _evaluate(self, reward: Callable[[Tensor], Tensor], inputs: F32) -> F32:
-        with threads(1):
-            parts = [reward(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)]
-        return np.concatenate(parts, axis=-1)
+        frames = torch.from_numpy(inputs)
+        with threads(1), torch.inference_mode():
+            parts = torch.from_numpy(sides).split(_PAIRS)
+            found = torch.cat([self.network.logits(frames, part) for part in parts], dim=1)
+        return found.numpy().astype(np.float64)
 
 
 def write_reward(

@@ -130,7 +130,7 @@ class EnvCheckOptions:
     """Check that an environment and its expert keep the contract that everything else relies on.
 
     The same seed gives the same start; a restored state goes on the same; the expert is a function
-    of the state, or says that it is not. Prints its success, and the time of a step and a label.
+    of the state, or says that it is not. Prints its success, and the time of a step with its label.
     The exit code is 1 if a part is not kept.
 
     Example: manip-il env check reacher.py

@@ -1,21 +1,23 @@
 """Comparison of sides on the same test episodes: which one is better, and what each cost."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import fmean
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import (
     CONFIDENCE,
-    PairCounts,
     Proportion,
     format_p,
     format_percent,
     format_points,
     mean_interval,
+    paired_interval,
     sign_flip_exact,
 )
 from manip_il.evaluation.report import Table
@@ -54,32 +56,34 @@ class Comparison:
             )
 
     @cached_property
-    def _outcomes(self) -> list[dict[int, tuple[bool, bool]]]:
-        """Outcomes (left, right) by test episode, for each training seed."""
-        found: list[dict[int, tuple[bool, bool]]] = []
-        for left, right in zip(self.left.results, self.right.results, strict=True):
-            theirs = {episode.seed: episode.success for episode in right.episodes}
-            found.append({one.seed: (one.success, theirs[one.seed]) for one in left.episodes})
-        return found
+    def _solved(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """1 where left or right solved an episode, else 0, (training seeds, episodes) each."""
+        return _outcomes(self.left), _outcomes(self.right)
 
     @cached_property
-    def pairs(self) -> tuple[PairCounts, ...]:
-        """The paired outcomes of each training seed."""
-        return tuple(PairCounts.of(outcomes.values()) for outcomes in self._outcomes)
+    def differences(self) -> NDArray[np.int64]:
+        """Right's success minus left's, (training seeds, test episodes)."""
+        left, right = self._solved
+        return right - left
+
+    @property
+    def means(self) -> list[float]:
+        """Difference in success rate for each training seed, in [-1, 1]."""
+        return self.differences.mean(axis=1).tolist()
 
     @property
     def difference(self) -> float:
         """Difference in success rate, averaged over training seeds, in [-1, 1]."""
-        return fmean(pair.difference for pair in self.pairs)
+        return fmean(self.means)
 
     @property
     def interval(self) -> tuple[float, float]:
-        """(low, high) of `difference`: Newcombe's interval for one training seed, Student's for
-        two or more.
+        """(low, high) of `difference`: Bonett and Price's interval for one training seed,
+        Student's for two or more.
         """
-        if len(self.pairs) == 1:
-            return self.pairs[0].interval
-        return mean_interval([pair.difference for pair in self.pairs])
+        if len(self.means) == 1:
+            return paired_interval(self.differences[0].tolist())
+        return mean_interval(self.means)
 
     @cached_property
     def p_value(self) -> float:
@@ -89,10 +93,7 @@ class Comparison:
 
         It holds for these trained policies; `interval` also covers other training seeds.
         """
-        margins: Counter[int] = Counter()
-        for seed, (left, right) in (one for outcomes in self._outcomes for one in outcomes.items()):
-            margins[seed] += right - left
-        return sign_flip_exact(list(margins.values()))
+        return sign_flip_exact(self.differences.sum(axis=0).tolist())
 
     @property
     def significant(self) -> bool:
@@ -100,16 +101,16 @@ class Comparison:
         the t interval.
         """
         low, high = self.interval
-        return self.p_value < 1 - CONFIDENCE and (len(self.pairs) == 1 or low > 0 or high < 0)
+        return self.p_value < 1 - CONFIDENCE and (len(self.means) == 1 or low > 0 or high < 0)
 
     @property
     def verdict(self) -> str:
         """A sentence: which side is better, or that neither is shown to be better, with
         difference, interval and p.
         """
-        n, sign = len(self.pairs), -1 if self.difference < 0 else 1
-        leads = sum(sign * pair.difference > 0 for pair in self.pairs)
-        tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes"
+        n, sign = len(self.means), -1 if self.difference < 0 else 1
+        leads = sum(sign * mean > 0 for mean in self.means)
+        tested = f"{format_p(self.p_value)}, {self.differences.shape[1]:,} paired episodes"
         tested += f" on each of {n} training seeds, ahead in {leads}" if n > 1 else ""
         if not self.significant:
             points = format_points(self.difference, self.interval)
@@ -124,7 +125,9 @@ class Comparison:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values; differences are right minus left."""
-        counts = ("both", "only_left", "only_right", "neither")
+        left, right = self._solved
+        kinds = ("neither", "only_right", "only_left", "both")
+        counts = np.bincount((2 * left + right).ravel(), minlength=len(kinds))
         return {
             "left": self.left.name,
             "right": self.right.name,
@@ -132,10 +135,10 @@ class Comparison:
             "interval": list(self.interval),
             "confidence": CONFIDENCE,
             "p_value": self.p_value,
-            "n_episodes": self.pairs[0].n,
+            "n_episodes": self.differences.shape[1],
             "verdict": self.verdict,
-            **{name: sum(getattr(pair, name) for pair in self.pairs) for name in counts},
-            "differences": [pair.difference for pair in self.pairs],
+            **dict(zip(kinds, counts.tolist(), strict=True)),
+            "differences": self.means,
         }
 
 
@@ -278,6 +281,12 @@ class Study:
                 for member, first in zip(side.members, self._reached(side), strict=True)
             ],
         }
+
+
+def _outcomes(side: Side) -> NDArray[np.int64]:
+    """Return 1 where a policy solved an episode, else 0, (training seeds, episodes by seed)."""
+    solved = (sorted((one.seed, one.success) for one in found.episodes) for found in side.results)
+    return np.array([[success for _, success in one] for one in solved], np.int64)
 
 
 def _mean_cost(cost: Cost, rounds: Sequence[Round | None]) -> str:

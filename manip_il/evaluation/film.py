@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from typing import Any
 
 import av
 import numpy as np
@@ -26,11 +26,26 @@ FILM_EVERY = 2  # control steps per frame of film
 _SIZE = (240, 320)  # height and width [pixels]
 
 
-def run_states(job: RolloutJob, seed: int) -> Episode:
-    """Return the episode of one seed with its states, identical to that in an evaluation of
-    `job`.
+def film_states(
+    env: EnvConfig, states: NDArray[Any], every: int, size: tuple[int, int] = _SIZE
+) -> bytes:
+    """Return an MP4 of an environment's states, in real time.
+
+    Args:
+        env: The environment, filmed by the first of its default cameras.
+        states: States of consecutive control steps, rows of `sim_state`, (N, m).
+        every: Control steps per frame of film.
+        size: Height and width [pixels].
+
+    Raises:
+        RenderError: if there is no off-screen OpenGL.
+        Unable: if the environment cannot be drawn.
     """
-    return next(replace(job, label="last").run([seed]))
+    spec = env_spec(env)
+    spec.require("drawn", "there is no film of it")
+    camera = spec.default_cameras[0]
+    pictures = render_states(env, CameraConfig((camera,), *size, FILM), states[::every])
+    return encode_mp4(list(pictures[schema.IMAGES + camera]), env.control_hz / every)
 
 
 def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str = "") -> Film:
@@ -46,13 +61,7 @@ def film_episode(env: EnvConfig, episode: Episode, title: str = "", caption: str
         RenderError: if there is no off-screen OpenGL.
         Unable: if the environment cannot be drawn.
     """
-    states = episode.columns[schema.SIM_STATE][::FILM_EVERY]
-    spec = env_spec(env)
-    spec.require("drawn", "there is no film of it")
-    camera = spec.default_cameras[0]
-    pictures = render_states(env, CameraConfig((camera,), *_SIZE, FILM), states)
-    frames = list(pictures[schema.IMAGES + camera])
-    return Film(title, encode_mp4(frames, env.control_hz / FILM_EVERY), caption)
+    return Film(title, film_states(env, episode.columns[schema.SIM_STATE], FILM_EVERY), caption)
 
 
 def collect_films(made: Iterable[Film], progress: Progress) -> list[Film]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -123,62 +123,19 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float]:
     return mean - half, mean + half
 
 
-@dataclass(frozen=True, slots=True)
-class PairCounts:
-    """Outcomes of two policies, left and right, on the same episodes.
+def paired_interval(differences: Sequence[int]) -> tuple[float, float]:
+    """Return (low, high), inside [-1, 1], for the difference of two paired proportions.
 
-    Attributes:
-        both: Number of episodes that both solved.
-        only_left: Number that only the left one solved.
-        only_right: Number that only the right one solved.
-        neither: Number that neither solved.
+    Bonett & Price (2012), Journal of Educational and Behavioral Statistics 37, 479-488: Wald's
+    interval after one more pair that only the left, and one more that only the right solves.
+
+    Args:
+        differences: Right's success minus left's in each episode, -1, 0 or 1.
     """
-
-    both: int
-    only_left: int
-    only_right: int
-    neither: int
-
-    @classmethod
-    def of(cls, outcomes: Iterable[tuple[bool, bool]]) -> PairCounts:
-        """Count the outcomes (left, right) of one or more episodes."""
-        pairs = Counter(outcomes)
-        return cls(pairs[True, True], pairs[True, False], pairs[False, True], pairs[False, False])
-
-    @property
-    def n(self) -> int:
-        """Number of pairs."""
-        return self.both + self.only_left + self.only_right + self.neither
-
-    @property
-    def difference(self) -> float:
-        """Rate of `right` minus rate of `left`, in [-1, 1]."""
-        return (self.only_right - self.only_left) / self.n
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """(low, high) of `difference`, inside [-1, 1].
-
-        Newcombe (1998), Statistics in Medicine 17, 2635-2650, method 10: combines the distances of
-        Wilson's limits from both rates, allowing for the continuity-corrected correlation of the
-        outcomes.
-        """
-        n = self.n
-        right = self.both + self.only_right
-        left = self.both + self.only_left
-        (l1, u1), (l2, u2) = wilson_interval(right, n), wilson_interval(left, n)
-        p1, p2 = right / n, left / n
-        cross = self.both * self.neither - self.only_right * self.only_left
-        if cross > 0:  # the correction shrinks a positive correlation, but not below zero
-            cross = max(cross - n / 2, 0.0)
-        margins = math.sqrt(right * (n - right) * left * (n - left))
-        phi = cross / margins if margins else 0.0
-
-        def add_squares(a: float, b: float) -> float:
-            return math.sqrt(max(0.0, a * a - 2 * phi * a * b + b * b))
-
-        low, high = add_squares(p1 - l1, u2 - p2), add_squares(u1 - p1, p2 - l2)
-        return max(-1.0, self.difference - low), min(1.0, self.difference + high)
+    adjusted = [*differences, -1, 1]
+    half = float(stats.norm.ppf((1 + CONFIDENCE) / 2) * stats.sem(adjusted, ddof=0))
+    mean = float(np.mean(adjusted))
+    return max(-1.0, mean - half), min(1.0, mean + half)
 
 
 def sign_flip_exact(differences: Sequence[int]) -> float:

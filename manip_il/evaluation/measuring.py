@@ -23,7 +23,7 @@ from manip_il.data.atomic import append_line, read_lines
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import MismatchError, UsageError, shorten, warn
 from manip_il.evaluation.eval_report import eval_report
-from manip_il.evaluation.film import film_outcomes, run_states
+from manip_il.evaluation.film import film_outcomes
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import (
     FILE_NAME,
@@ -467,7 +467,7 @@ def replay(
         warn(f"{policy} is not the policy of {file}: its files differ")
     here = env_fingerprint(env, observed_cameras(job))
     warn(*compare_fingerprints(str(file), dict(result.fingerprint), "this machine", here))
-    episode = run_states(job, seed)
+    [episode] = job.run([seed])
     return Replay(
         by_seed[seed], job, episode, replay_differences(by_seed[seed], episode_result(job, episode))
     )

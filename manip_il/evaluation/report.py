@@ -64,26 +64,22 @@ class Figure:
 
 
 @contextmanager
-def drawing(
-    columns: int, rows: int = 1, *, size: tuple[float, float], **options: Any
-) -> Iterator[tuple[Any, Any]]:
+def drawing(columns: int, *, size: tuple[float, float]) -> Iterator[tuple[Any, Any]]:
     """Yield a figure and its axes in the reports' style.
 
     Args:
         columns: Number of panels side by side.
-        rows: Number of panels above each other.
         size: Width and height of one panel [inches].
-        options: Further arguments of matplotlib's `Figure.subplots`.
 
     Yields:
-        The figure, and its axes as an array (rows, columns).
+        The figure, and its axes as an array (1, columns).
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure as Drawn
 
     with mpl.rc_context(_STYLE):
-        drawn = Drawn((size[0] * columns, size[1] * rows), layout="constrained")
-        yield drawn, drawn.subplots(rows, columns, squeeze=False, **options)
+        drawn = Drawn((size[0] * columns, size[1]), layout="constrained")
+        yield drawn, drawn.subplots(1, columns, squeeze=False)
 
 
 def to_figure(drawn: Any, words: str) -> Figure:

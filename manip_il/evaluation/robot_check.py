@@ -10,12 +10,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.collect.job import HOLD, RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.errors import RenderError, UsageError
-from manip_il.evaluation.measuring import measure
+from manip_il.evaluation.measuring import evaluate
 from manip_il.evaluation.report import (
-    INK,
     INTERVAL,
     Figure,
     Report,
@@ -25,14 +23,12 @@ from manip_il.evaluation.report import (
     to_figure,
 )
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.suites import read_condition
 from manip_il.option import NameOrPath
 from manip_il.progress import Progress
 from manip_il.robots.reach import reach_of
 from manip_il.robots.robot import Robot
 from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for, stream_seeds
-from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.config import CAMERAS, FILM, CameraConfig
 from manip_il.sim.render import pictures
 from manip_il.sim.scene import PREFIX
@@ -44,8 +40,8 @@ FILE_NAME = "check.json"
 SOLVES = 0.9  # share of clean episodes that the expert must solve if a task is to count as possible
 STARTS = 50  # number of starts drawn per task
 ENOUGH = 0.95  # share of the workspace that a suitable robot reaches
+_GRID = 41  # points along an axis of a map of the table
 LOW = 0.03  # height of objects on the table [m]
-_ROOM = 0.13  # margin of the map around the workspace [m]
 _VIEW = (4.4, 3.5)  # size of a picture of the arm [inches]
 
 
@@ -141,15 +137,19 @@ def check_robot(
     checked = [check_starts(name, task) for task in tasks]
     for place, task in enumerate(checked):
         if episodes and not task.refused:
-            found: list[EvalResult] = []
-            for condition in (NOMINAL, read_condition("random_actions")):
-                job = RolloutJob(
-                    make_config(name, task.name), hold=HOLD, label="last", conditions=(condition,)
+            clean, noisy = (
+                evaluate(
+                    env=make_config(name, task.name),
+                    episodes=episodes,
+                    suite=suite,
+                    stream="validation",
+                    workers=engine,
+                    progress=progress,
                 )
-                seeds = stream_seeds("validation", episodes)
-                found.append(measure(engine, job, seeds, "expert", progress, suite=condition.name))
-            checked[place] = replace(task, clean=found[0], noisy=found[1])
-    table = float(_reached(robot, robot.workspace.half_width, 41).mean())
+                for suite in ("nominal", "random_actions")
+            )
+            checked[place] = replace(task, clean=clean, noisy=noisy)
+    table = float(_reached(robot, robot.workspace.half_width).mean())
     return RobotCheck(name, robot, scene.gripper.most, table, tuple(checked))
 
 
@@ -170,14 +170,14 @@ def check_starts(name: NameOrPath, task: str) -> TaskCheck:
     return TaskCheck(task, starts)
 
 
-def _reached(robot: Robot, half: float, n: int) -> NDArray[np.bool_]:
-    """Return whether the hand, pointing down, reaches each point of a grid on the table, (n, n),
-    row by row along x.
+def _reached(robot: Robot, half: float) -> NDArray[np.bool_]:
+    """Return whether the hand, pointing down, reaches each point of a grid on the table: y along
+    the rows, x along the columns, (n, n).
     """
-    steps = np.linspace(-half, half, n)
+    steps = np.linspace(-half, half, _GRID)
     x, y = robot.workspace.centre
     points = np.stack(np.meshgrid(x + steps, y + steps, [LOW]), axis=-1)
-    return reach_of(robot).has_each(points.reshape(-1, 3)).reshape(n, n)
+    return reach_of(robot).has_each(points.reshape(-1, 3)).reshape(_GRID, _GRID)
 
 
 def check_report(check: RobotCheck) -> Report:
@@ -195,11 +195,8 @@ def check_report(check: RobotCheck) -> Report:
     )
     home = (
         "Axes of ee: x red, y (along the fingers' motion) green, z (out of the hand) blue. "
-        f"The gripper opens to {1000 * check.opening:.1f} mm."
-    )
-    reach = (
-        f"Pointing down, the hand reaches {100 * check.table:.0f} % of the workspace on the table"
-        " (the frame). Points that it reaches are green."
+        f"The gripper opens to {1000 * check.opening:.1f} mm. Pointing down, the hand reaches"
+        f" {100 * check.table:.0f} % of the workspace on the table."
     )
     return Report(
         title=f"{check.robot.name}: robot check",
@@ -208,7 +205,6 @@ def check_report(check: RobotCheck) -> Report:
         sections=(
             Section("Tasks", tables=(task_table(check),), notes=(tasks,)),
             Section("At home in its scene", lead, figures=pictures, notes=(home,)),
-            Section("Where it reaches", figures=(_reach_figure(check.robot),), notes=(reach,)),
         ),
     )
 
@@ -239,35 +235,6 @@ def task_table(check: RobotCheck) -> Table:
     return Table(columns, rows)
 
 
-def _reach_figure(robot: Robot) -> Figure:
-    """Draw the region of the table that the hand, pointing down, reaches, and the workspace."""
-    (x, y), half = robot.workspace.centre, robot.workspace.half_width
-    wide = half + _ROOM
-    extent = (x - wide, x + wide, y - wide, y + wide)
-    with drawing(1, size=(3.6, 3.6)) as (drawn, axes):
-        axis = axes[0, 0]
-        reached = _reached(robot, wide, 61).astype(float)
-        axis.imshow(
-            reached,
-            extent=extent,
-            origin="lower",
-            cmap="Greens",
-            vmin=0,
-            vmax=3,
-            interpolation="nearest",
-        )
-        axis.hlines([y - half, y + half], x - half, x + half, color=INK, lw=1)
-        axis.vlines([x - half, x + half], y - half, y + half, color=INK, lw=1)
-        axis.set(
-            xlim=extent[:2],
-            ylim=extent[2:],
-            xlabel="x, away from the base [m]",
-            ylabel="y, to its left [m]",
-        )
-        axis.grid(visible=False)
-        return to_figure(drawn, "Where the hand reaches on the table, from above")
-
-
 def advice(check: RobotCheck) -> tuple[str, ...]:
     """Return what to change in the robot's YAML: first for the arm, then for each task that it
     cannot do.
@@ -276,11 +243,19 @@ def advice(check: RobotCheck) -> tuple[str, ...]:
     lines = _overlaps(scene_of(check.name, "reach"))
     if check.table < ENOUGH:
         x, y = space.centre
+        wide = 2 * space.half_width
+        steps = np.linspace(-wide, wide, _GRID)
+        rows, columns = np.nonzero(_reached(check.robot, wide))  # along y, and along x
+        middle = "elsewhere"
+        if len(rows):
+            middle = (
+                f"{x + steps[columns].mean():.2f}, {y + steps[rows].mean():.2f}, the centre of the"
+                " points near it that it reaches"
+            )
         lines.append(
             f"The hand reaches {100 * check.table:.0f} % of the workspace on the table: reduce"
             f" workspace.half_width (now {space.half_width:g}), or move workspace.centre (now"
-            f" {x:g}, {y:g}) to where the map is green; if it is green nowhere, turn the gripper on"
-            " the hand by gripper.quaternion."
+            f" {x:g}, {y:g}) to {middle}, or turn the gripper on the hand by gripper.quaternion."
         )
     for task in check.failed:
         if task.refused and check.table:  # if no point is within reach, the first line says so

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from manip_il.evaluation.intervals import format_percent, wilson_interval
-from manip_il.mdp import F64
+from manip_il.collect.job import RolloutJob
+from manip_il.data.schema import LABEL_VALID
+from manip_il.evaluation.intervals import Proportion
+from manip_il.mdp import F64, Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.contract import Environment
@@ -61,7 +63,7 @@ def check_world(config: EnvConfig, episodes: int, step: Callable[[], None]) -> I
         yield _labels(config, env, other, seeds[:_SEEDS])
     else:
         yield Check("labels", "the expert keeps memory, as it says, so it is asked in every step")
-    yield from _episodes(config, env, seeds[:episodes], step)
+    yield from _episodes(config, seeds[:episodes], step)
 
 
 def _starts(env: Environment, other: Environment, seeds: range) -> Check:
@@ -134,40 +136,26 @@ def _labels(config: EnvConfig, env: Environment, other: Environment, seeds: rang
     return Check("labels", "a function of the state; labelling changes nothing")
 
 
-def _episodes(
-    config: EnvConfig, env: Environment, seeds: range, step: Callable[[], None]
-) -> Iterator[Check]:
-    """Yield the expert's success, and the time of steps and labels."""
-    expert, taken = make_expert(config), list[int]()
-    solved = invalid = 0
-    spent = {"step": 0.0, "label": 0.0}
-    for seed in seeds:
-        env.start(seed)
-        steps, has_ended = 0, False
-        while steps < config.horizon and not has_ended:
-            env.observe()
-            state = env.get_state()
-            begin = time.perf_counter()
-            label = expert.label(state, env)
-            middle = time.perf_counter()
-            outcome = env.step(label.action)
-            steps += 1
-            has_ended = outcome.solved or outcome.ended
-            solved += outcome.solved
-            spent["label"] += middle - begin
-            spent["step"] += time.perf_counter() - middle
-            invalid += not label.valid
-        taken.append(steps)
+def _episodes(config: EnvConfig, seeds: range, step: Callable[[], None]) -> Iterator[Check]:
+    """Yield the expert's success, and the time of a step with its label."""
+    found = list[Episode]()
+    began = time.perf_counter()
+    for episode in RolloutJob(config, hold=0).run(seeds):
+        found.append(episode)
         step()
-    if not seeds:
+    spent = time.perf_counter() - began
+    if not found:
         return
-    low, high = wilson_interval(solved, len(seeds))
-    rate = f"{solved} of {len(seeds)} [{format_percent(low)}, {format_percent(high)}]"
-    median = int(np.median(taken))
-    advice = "" if solved else "a policy learns nothing from it"
-    yield Check("expert", f"solves {rate}, in {median} steps; {invalid} labels not valid", advice)
-    each = {name: 1000 * seconds / sum(taken) for name, seconds in spent.items()}
-    yield Check("time", f"{each['step']:.2f} ms a step, {each['label']:.2f} ms a label")
+    success = Proportion.of([episode.success for episode in found])
+    steps = [len(episode) for episode in found]
+    invalid = sum(int((episode.columns[LABEL_VALID] == 0).sum()) for episode in found)
+    yield Check(
+        "expert",
+        f"solves {success} of {len(found)} episodes, in {np.median(steps):.0f} steps;"
+        f" {invalid} labels not valid",
+        "" if success.successes else "a policy learns nothing from it",
+    )
+    yield Check("time", f"{1000 * spent / sum(steps):.2f} ms a step with its label")
 
 
 def _drive(config: EnvConfig, env: Environment, seed: int) -> None:

@@ -302,12 +302,16 @@ class MLPNetwork(nn.Module):
 
         The last bits depend on the number of rows.
         """
-        y = self.head.action(self.outputs(inputs))
-        # The expert's targets never left this range, so the learner's must not either.
-        target = torch.clamp(
+        return self.decode_targets(self.head.action(self.outputs(inputs))) + self._measured(inputs)
+
+    def decode_targets(self, y: Tensor) -> Tensor:
+        """Return raw targets (B, n) for normalised targets (B, n), as from `encode_targets`.
+
+        The expert's targets never left their range in the data, so these do not either.
+        """
+        return torch.clamp(
             y * self.target_scale + self.target_mean, self.target_low, self.target_high
         )
-        return target + self._measured(inputs)
 
     def _measured(self, inputs: Tensor) -> Tensor | float:
         """Return the measured joints that are added to the targets, (B, n); 0 if there are none."""

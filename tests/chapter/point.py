@@ -6,14 +6,11 @@ import numpy as np
 import torch
 
 from manip_il.chapter.config import PPOConfig
-from manip_il.chapter.episodes import ActionRange, Lockstep
+from manip_il.chapter.episodes import Lockstep
 from manip_il.chapter.ppo import Learner, seed_generators
 from manip_il.learn.network import MLPNetwork, NetworkConfig
 
 STEPS, EPISODES = 10, 8
-ACTIONS = ActionRange(
-    *(np.array(values, np.float32) for values in ([0, 0], [0.5, 0], [-1, 0], [1, 0]))
-)
 
 
 class Point:
@@ -43,13 +40,16 @@ class Point:
         return self.ends and self.solved
 
 
-def network() -> MLPNetwork:
+def network(scale: tuple[float, ...] = (0.5, 0.0), most: tuple[float, ...] = (1, 0)) -> MLPNetwork:
+    """An actor on three numbers, whose targets have mean 0, a scale, and a largest size."""
     made = MLPNetwork(
-        3, 2, NetworkConfig(width=32, depth=2, loss="gaussian", action_space="joint_target")
+        3,
+        len(scale),
+        NetworkConfig(width=32, depth=2, loss="gaussian", action_space="joint_target"),
     )
-    names = ("mean", "scale", "low", "high")
+    high = torch.tensor(most, dtype=torch.float32)
     made.set_statistics(
-        {f"target_{name}": torch.from_numpy(getattr(ACTIONS, name)) for name in names}
+        {"target_scale": torch.tensor(scale), "target_low": -high, "target_high": high}
     )
     return made
 
@@ -57,6 +57,7 @@ def network() -> MLPNetwork:
 def learner(seed: int = 0, ends: bool = True, **options: float) -> Learner:
     """A learner on points, drawn from a seed."""
     seed_generators(seed)
-    env = Lockstep([Point(ends) for _ in range(EPISODES)], ACTIONS, STEPS)
+    actor = network()
+    env = Lockstep([Point(ends) for _ in range(EPISODES)], actor, STEPS)
     config = PPOConfig(**{"minibatches": 4, **options})
-    return Learner(network(), config, env, log_std=-0.5)
+    return Learner(actor, config, env, log_std=-0.5)

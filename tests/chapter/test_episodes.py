@@ -5,10 +5,12 @@ its seed alone.
 import numpy as np
 import pytest
 
-from manip_il.chapter.episodes import ActionRange, Lockstep, RobotEpisode
+from manip_il.chapter.episodes import Lockstep, RobotEpisode
 from manip_il.learn.action_spaces import Conversion
 from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import make_config
+
+from .point import network
 
 ENV = make_config("fetch", "reach")
 HAND = Conversion("ee_delta", "fetch")
@@ -22,9 +24,8 @@ def up(height: float) -> np.ndarray:
 
 
 def lockstep(count: int, hold: int | None = 2, horizon: int = 12) -> Lockstep:
-    ones = np.ones(8, np.float32)
     episodes = [RobotEpisode(ENV, hold) for _ in range(count)]
-    return Lockstep(episodes, ActionRange(0 * ones, ones, -ones, ones), horizon, HAND)
+    return Lockstep(episodes, network((1.0,) * 8, (1.0,) * 8), horizon, HAND)
 
 
 def test_a_target_reaches_the_robot_as_the_joints_it_means():

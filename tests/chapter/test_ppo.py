@@ -25,7 +25,7 @@ def test_the_density_is_that_of_the_policy_network_above_its_mean():
     rng = np.random.default_rng(1)
     states = np.pad(rng.normal(size=(20, 3)).astype(np.float32), ((0, 0), (0, 1)))
     actions = rng.uniform(-1, 1, (20, 2)).astype(np.float32)
-    raw = torch.from_numpy(one.env.range.raw(actions))
+    raw = one.policy.actor.decode_targets(torch.from_numpy(actions))
     with torch.no_grad():
         mean = one.policy.actor.layers(one.policy.actor.encode(torch.from_numpy(states[:, :3])))
         theirs, still = (

@@ -9,6 +9,7 @@ from manip_il.chapter.episodes import Demonstrations, read_demonstrations
 from manip_il.mdp import Actor
 
 from ..learn.conftest import EPISODES, LENGTH, make_table
+from .point import network
 
 
 def two() -> Demonstrations:
@@ -17,21 +18,18 @@ def two() -> Demonstrations:
     return Demonstrations(inputs, targets, hold=2)
 
 
-def doubled(values):
-    return values * 2
-
-
 def test_a_demonstration_goes_on_in_the_absorbing_state_until_the_last_step():
-    rows = two().padded(8, doubled)
+    rows = two().padded(8, network((0.5, 0.5), (5, 5)))
     assert len(rows) == 16
     assert rows.absorbing.tolist() == [False] * 4 + [True] * 4 + [False] * 6 + [True] * 2
     assert rows.actions[0].tolist() == [8, 8]
+    assert rows.actions[8].tolist() == [10, 10], "targets stay within the policy's range"
     assert not rows.actions[rows.absorbing].any()
     assert rows.next_states[3].tolist() == [0, 0, 0, 1]
 
 
 def test_a_demonstration_that_fills_the_episode_still_ends_in_the_absorbing_state():
-    rows = two().padded(6, doubled)
+    rows = two().padded(6, network((0.5, 0.5), (5, 5)))
     assert len(rows) == 12
     assert rows.next_states[-1].tolist() == [0, 0, 0, 1]
 

@@ -3,15 +3,17 @@ keep their properties.
 """
 
 import itertools
+import math
 import random
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.evaluation.intervals import (
-    PairCounts,
     Proportion,
+    paired_interval,
     sign_flip_exact,
     wilson_interval,
 )
@@ -52,24 +54,29 @@ def test_a_confidence_sequence_holds_at_every_look_where_wilsons_does_not():
 
 
 @pytest.mark.parametrize(
-    ("table", "low", "high"),
-    [
-        # Fagerland, Lydersen, Laake (2014), Statistics in Medicine 33, 2850-2875: both worked
-        # examples
-        ((1, 1, 7, 12), -0.507, -0.026),
-        ((59, 6, 16, 80), -0.1186, -0.0046),
-        # Altman et al. (2000), Statistics with Confidence, table 6.2
-        ((14, 5, 0, 22), 0.011, 0.226),
-    ],
+    ("both", "only_first", "only_second", "neither"),
+    # the worked examples of Fagerland, Lydersen, Laake (2014), Statistics in Medicine 33, 2850-2875
+    [(1, 1, 7, 12), (59, 6, 16, 80), (0, 0, 0, 5), (30, 0, 2, 18)],
 )
-def test_newcombes_paired_interval_agrees_with_worked_examples(
-    table: tuple[int, int, int, int], low: float, high: float
+def test_the_paired_interval_is_walds_with_one_more_of_each_discordant_pair(
+    both: int, only_first: int, only_second: int, neither: int
 ):
-    digits = 5e-5 if round(low, 3) != low else 5e-4
-    both, only_first, only_second, neither = table
-    assert PairCounts(both, only_second, only_first, neither).interval == pytest.approx(
-        (low, high), abs=digits
+    n = both + only_first + only_second + neither + 2
+    first, second = (only_first + 1) / n, (only_second + 1) / n
+    half = 1.959964 * math.sqrt((first + second - (first - second) ** 2) / n)
+    outcomes = [1] * only_first + [-1] * only_second + [0] * (both + neither)
+    assert paired_interval(outcomes) == pytest.approx(
+        (first - second - half, first - second + half), abs=1e-6
     )
+
+
+def test_the_paired_interval_covers_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    for chances in ([0.02, 0.9, 0.08], [0.1, 0.7, 0.2], [0.3, 0.4, 0.3]):
+        drawn = rng.choice([-1, 0, 1], size=(1_000, 50), p=chances)
+        intervals = [paired_interval(one.tolist()) for one in drawn]
+        covered = [low <= chances[2] - chances[0] <= high for low, high in intervals]
+        assert 0.93 < np.mean(covered) < 0.99
 
 
 @pytest.mark.parametrize(
@@ -93,12 +100,10 @@ def test_with_one_training_seed_the_test_is_mcnemars_with_the_exact_binomial(
 def test_the_paired_interval_contains_the_difference_and_changes_sign_with_the_order(
     pairs: list[tuple[bool, bool]],
 ):
-    a, b = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-    forward, backward = PairCounts.of(zip(a, b, strict=True)), PairCounts.of(zip(b, a, strict=True))
-    low, high = forward.interval
-    assert -1 <= low <= forward.difference <= high <= 1
-    assert backward.interval == pytest.approx((-high, -low), abs=1e-12)
-    assert forward.difference == pytest.approx((sum(b) - sum(a)) / len(pairs))
+    differences = [right - left for left, right in pairs]
+    low, high = paired_interval(differences)
+    assert -1 <= low <= sum(differences) / len(pairs) <= high <= 1
+    assert paired_interval([-one for one in differences]) == pytest.approx((-high, -low), abs=1e-12)
 
 
 @given(few)

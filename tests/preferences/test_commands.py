@@ -38,7 +38,7 @@ def test_a_reward_is_learnt_and_weighs_the_frames_of_a_clone(here, capsys):
     )
     assert "80 answers about 40 pairs" in capsys.readouterr().out
     found = json.loads((here / "reward" / "fit.json").read_text())
-    assert 30 <= found["agreement_with_progress"]["of"] <= 40
+    assert 60 <= found["agreement_with_answers"]["of"] <= 80
     assert run("data score bad --reward=reward --output_dir=scores") == 0
     words = (
         "--dataset.root=bad --weights=scores/rabc.parquet --steps=2 --batch_size=8 --policy.width=8"

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import expit
 
 from manip_il.chapter.preferences.pairs import (
     Answer,
     Pairs,
     Preferences,
     choose_pairs,
-    disagreement,
     find_datasets,
     join_pairs,
     read_clips,
@@ -45,17 +45,19 @@ def test_pairs_of_different_tasks_are_refused(datasets):
 
 
 def test_an_ensemble_chooses_the_pairs_that_it_disagrees_about(datasets):
-    def members(inputs):
-        return np.random.default_rng(1).normal(size=(3, inputs.shape[1])) @ inputs.T
+    def logits(inputs, sides):
+        rewards = np.random.default_rng(1).normal(size=(3, inputs.shape[1])) @ inputs.T
+        left, right = (rewards[:, sides[:, side]].sum(axis=-1) for side in (0, 1))
+        return left - right
 
     roots, reward = (
         [datasets / "good", datasets / "bad"],
-        SimpleNamespace(members=members, check_fits=lambda *_: None),
+        SimpleNamespace(logits=logits, check_fits=lambda *_: None),
     )
     clips = [
         choose_pairs(roots, 10, 20, 0, np.random.default_rng(0), one) for one in (reward, None)
     ]
-    doubts = [disagreement(one, members).mean() for one in clips]
+    doubts = [expit(logits(one.data.inputs, one.rows)).std(axis=0).mean() for one in clips]
     assert doubts[0] > 1.1 * doubts[1]
 
 

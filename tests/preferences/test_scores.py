@@ -10,7 +10,7 @@ import torch
 from lerobot.rewards.sarm.rabc import RABCWeights
 
 from manip_il.chapter.preferences.pairs import Frames, read_frames
-from manip_il.chapter.preferences.scores import Scores, roc_auc, write_weights
+from manip_il.chapter.preferences.scores import Scores, write_weights
 from manip_il.learn.samples import rabc_weights
 
 
@@ -27,14 +27,7 @@ def scored(datasets) -> Scores:
     return Scores("both", "a test", data, np.clip(joined["progress"] + noise, 0, 1))
 
 
-def test_the_area_under_the_curve_is_the_share_of_pairs_in_order():
-    scores, succeeded = np.array([0.1, 0.4, 0.4, 0.9]), np.array([False, True, False, True])
-    assert roc_auc(scores, succeeded) == pytest.approx((1 + 0.5 + 1 + 1) / 4)
-    assert roc_auc(scores, np.ones(4, bool)) is None
-
-
 def test_failed_episodes_are_found_and_listed_first(scored):
-    assert scored.auc == 1
     assert not scored.succeeded[np.argsort(scored.episodes)[:8]].any()
     tree = scored.to_json()
     assert [one["success"] for one in tree["episodes"]] == [True] * 8 + [False] * 8

@@ -63,14 +63,31 @@ def test_the_gap_is_the_difference_of_returns_over_all_paths():
     assert one.visits(policies).sum(axis=2) == pytest.approx(np.ones((3, 4)))
 
 
-def test_trajectories_are_where_the_policy_is_and_the_same_seed_draws_the_same(process):
+def visited_by_walking(process: Process, policy: np.ndarray, count: int, rng) -> np.ndarray:
+    """Which states of each step `count` trajectories of a policy (H, S) visit, step by step."""
+    found = np.zeros(policy.shape, bool)
+    for _ in range(count):
+        state = rng.choice(process.states, p=process.start)
+        for t in range(len(policy)):
+            found[t, state] = True
+            action = WRONG if rng.random() < policy[t, state] else RIGHT
+            state = rng.choice(process.states, p=process.moves[action, state])
+    return found
+
+
+def test_states_are_seen_as_often_as_trajectories_visit_them():
+    one, rng, count, times = small(), np.random.default_rng(2), 3, 2_000
+    policy = rng.random((4, one.states))
+    drawn = one.seen(np.broadcast_to(policy, (times, *policy.shape)), count, rng)
+    walked = [visited_by_walking(one, policy, count, rng) for _ in range(times)]
+    assert drawn.mean(axis=0) == pytest.approx(np.mean(walked, axis=0), abs=0.06)
+
+
+def test_only_states_that_the_policy_reaches_are_seen_and_the_same_seed_draws_the_same(process):
     policy = np.full((2, 6, process.states), 0.3)
-    seen = [
-        process.seen(policy, 4_000, [np.random.default_rng(seed) for seed in (5, 6)])
-        for _ in range(2)
-    ]
-    assert (seen[0] == seen[1]).all()
-    assert (seen[0] == (process.visits(policy) > 1e-12)).mean() > 0.999
+    seen, again = (process.seen(policy, 4_000, np.random.default_rng(5)) for _ in range(2))
+    assert (seen == again).all()
+    assert (seen == (process.visits(policy) > 1e-12)).mean() > 0.999
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import math
 from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
@@ -11,12 +12,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from manip_il.chapter.preferences.pairs import PREFERENCES, VERSION, Clips, Pairs
-from manip_il.collect.edits import open_source, render_states
+from manip_il.collect.edits import open_source
 from manip_il.data import schema
 from manip_il.data.dataset import joined_columns
-from manip_il.evaluation.film import encode_mp4
-from manip_il.sim.config import FILM, CameraConfig
-from manip_il.worlds.table import env_spec
+from manip_il.evaluation.film import film_states
 
 SIDE = 240  # edge of a film [pixels]
 MOST_FPS = 10  # films play in real time; rendering a picture takes tens of milliseconds
@@ -43,20 +42,16 @@ def render_films(
         ManipError: If the states of a source cannot be rendered.
     """
     opened = [open_source(root, robot) for root in clips.roots]
-    datasets = [source.dataset for source in opened]
-    states = joined_columns(datasets, [schema.SIM_STATE])[schema.SIM_STATE]
-    spec = env_spec(opened[0].env)
-    spec.require("drawn", "choose another robot")
-    camera = spec.default_cameras[0]
-    config = CameraConfig((camera,), SIDE, SIDE, FILM)
-    every = -(-clips.pairs.control_hz // MOST_FPS)
+    states = joined_columns([one.dataset for one in opened], [schema.SIM_STATE])[schema.SIM_STATE]
+    every = math.ceil(clips.pairs.control_hz / MOST_FPS)
     found: Films = []
-    for pair, rows in zip(clips.pairs.pairs, clips.rows[:, :, ::every], strict=True):
-        shown = (
-            render_states(opened[clip.source].env, config, states[own])[schema.IMAGES + camera]
-            for clip, own in zip(pair, rows, strict=True)
+    for pair, rows in zip(clips.pairs.pairs, clips.rows, strict=True):
+        found.append(
+            [
+                film_states(opened[clip.source].env, states[own], every, (SIDE, SIDE))
+                for clip, own in zip(pair, rows, strict=True)
+            ]
         )
-        found.append([encode_mp4(list(one), clips.pairs.control_hz // every) for one in shown])
         on_pair()
     return found
 

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from manip_il.chapter.preferences.pairs import Answers, Clips
@@ -29,7 +28,6 @@ from manip_il.learn.batches import generator_of
 from manip_il.learn.network import threads
 from manip_il.mdp import F64, I64
 
-TIE = 0.01  # if the clips' mean progress differs by less, neither is better
 BY_CHANCE = 0.1  # E, the share of random answers
 _LR = 1e-4
 _WEIGHT_DECAY = 1.0
@@ -51,22 +49,22 @@ class FittedReward:
         logits: R(left) - R(right) of every answer, by the network that held it out, (A,).
         epochs: Number of epochs that the networks were trained for.
         answered: Agreement with the answers that are not `equal`.
-        true: Agreement with true progress, without pairs that differ by less than `TIE`.
     """
 
     network: RewardNetwork
     logits: F64
     epochs: int
     answered: Proportion
-    true: Proportion
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of `fit.json`."""
-        return {
-            "agreement_with_answers": _counts(self.answered),
-            "agreement_with_progress": _counts(self.true),
-            "epochs": self.epochs,
+        right = {
+            "rate": self.answered.rate,
+            "interval": list(self.answered.interval),
+            "right": self.answered.successes,
+            "of": self.answered.n,
         }
+        return {"agreement_with_answers": right, "epochs": self.epochs}
 
 
 def fit_answers(
@@ -102,25 +100,16 @@ def fit_answers(
         network.std.copy_(features.std(0).clamp(min=1e-6))
         epochs = _train(network, inputs, sides, answers.better, folds, seed, on_epoch)
         with torch.no_grad():
-            every = _logits(network, inputs, sides).numpy().astype(np.float64)
+            every = network.logits(inputs, sides).numpy().astype(np.float64)
             logits = every[folds, np.arange(len(folds))]
             rewards = torch.cat([network.members(part).mean(0) for part in inputs.split(_ROWS)])
             some = rewards[:: max(1, len(rewards) // _MOST_FRAMES)]
             low, high = torch.quantile(some, torch.tensor(_RANGE)).tolist()
         network.low.fill_(low)
         network.high.fill_(max(high, low + 1e-6))
-    right = (logits > 0) == (answers.better > 0.5)
-    pairs, first = np.unique(answers.pair, return_index=True)
-    difference = true_difference(clips)[pairs]
-    true = ((logits[first] > 0) == (difference > 0))[np.abs(difference) >= TIE]
-    answered = _proportion(right[answers.better != 0.5])
-    return FittedReward(network, logits, epochs, answered, _proportion(true))
-
-
-def true_difference(clips: Clips) -> F64:
-    """Return the mean true progress of each left clip minus that of the right one, (P,)."""
-    means = clips.data.progress[clips.rows].mean(axis=-1)
-    return means[:, 0] - means[:, 1]
+    right = ((logits > 0) == (answers.better > 0.5))[answers.better != 0.5]
+    answered = Proportion(int(right.sum()), max(len(right), 1))
+    return FittedReward(network, logits, epochs, answered)
 
 
 def summary_lines(found: FittedReward, answers: Answers) -> list[str]:
@@ -129,7 +118,6 @@ def summary_lines(found: FittedReward, answers: Answers) -> list[str]:
     return [
         f"{given}, {answers.skipped:,} skipped",
         f"agreement with answers on held-out pairs: {found.answered}",
-        f"agreement with true progress on held-out pairs: {found.true} of {found.true.n:,}",
     ]
 
 
@@ -191,14 +179,14 @@ def _train(
     generator = generator_of(seed, 1)
     for epoch in range(1, _EPOCHS + 1):
         for rows in torch.randperm(len(better), generator=generator).split(_BATCH):
-            losses = answer_losses(_logits(network, inputs, sides[rows]), better[rows])
+            losses = answer_losses(network.logits(inputs, sides[rows]), better[rows])
             optimizer.zero_grad(set_to_none=True)
             (
                 (losses * learns[:, rows]).sum(1) / learns[:, rows].sum(1).clamp(min=1)
             ).sum().backward()
             optimizer.step()
         with torch.no_grad():
-            losses = answer_losses(_logits(network, inputs, sides), better)
+            losses = answer_losses(network.logits(inputs, sides), better)
         on_epoch()
         if (loss := losses[left_out].mean().item()) < lowest:
             lowest, best = loss, epoch
@@ -207,22 +195,3 @@ def _train(
             break
     network.load_state_dict(kept)
     return best
-
-
-def _logits(network: RewardNetwork, inputs: Tensor, sides: Tensor) -> Tensor:
-    """R(left) - R(right) for every network, (M, A). sides: rows of `inputs` of both clips, (A,
-    2, L).
-    """
-    rows = [sides[:, side] for side in (0, 1)]
-    left, right = (
-        network.members(inputs[one.reshape(-1)]).view(-1, *one.shape).sum(-1) for one in rows
-    )
-    return left - right
-
-
-def _proportion(right: NDArray[np.bool_]) -> Proportion:
-    return Proportion(int(right.sum()), max(len(right), 1))
-
-
-def _counts(one: Proportion) -> dict[str, Any]:
-    return {"rate": one.rate, "interval": list(one.interval), "right": one.successes, "of": one.n}

@@ -38,7 +38,6 @@ from manip_il.mdp import F32, F64, I64, require_finite
 from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.worlds.fingerprint import canonical_json
 
-Members = Callable[[F32], F64]  # maps inputs (B, d) to the rewards (M, B) of M networks
 POOL = 10  # candidates per pair when choosing by disagreement
 _TRIES = 100  # attempts to draw a new pair
 FORMAT, VERSION = "manip_il pairs", 1
@@ -332,21 +331,11 @@ def choose_pairs(
     )
     if reward is not None:
         reward.check_fits(str(roots[0]), spec)
-        spread = disagreement(Clips(made, tuple(roots), data), reward.members)
-        kept = np.sort(np.argsort(-spread, kind="stable")[:count])
+        logits = reward.logits(data.inputs, Clips(made, tuple(roots), data).rows)
+        kept = np.sort(np.argsort(-expit(logits).std(axis=0), kind="stable")[:count])
         pairs = tuple(drawn[place] for place in kept)
         made = replace(made, pairs=pairs, chosen="where rewards disagree")
     return Clips(made, tuple(roots), data)
-
-
-def disagreement(clips: Clips, members: Members) -> F64:
-    """Return the standard deviation of P(left is better) over the networks of an ensemble, one
-    per pair, (P,).
-    """
-    rows = clips.rows
-    rewards = members(clips.data.inputs[rows.reshape(-1)])
-    returns = rewards.reshape(len(rewards), *rows.shape).sum(-1)
-    return expit(returns[:, :, 0] - returns[:, :, 1]).std(axis=0)
 
 
 def _draw(

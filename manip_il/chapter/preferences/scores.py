@@ -21,7 +21,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from scipy.stats import mannwhitneyu
 
 from manip_il.chapter.preferences.pairs import Frames
 from manip_il.data.atomic import writing
@@ -76,14 +75,6 @@ class Scores:
         """Whether each episode succeeded at some step, (E,)."""
         return np.logical_or.reduceat(self.data.success, self.data.firsts)
 
-    @property
-    def auc(self) -> float | None:
-        """Area under the ROC curve for detecting failed episodes by a low score.
-
-        None if all or none failed.
-        """
-        return roc_auc(self.episodes, self.succeeded)
-
     def to_json(self) -> dict[str, Any]:
         """Return the content of `scores.json`; frames' scores are in the parquet file."""
         succeeded, bar = self.succeeded, self.bar
@@ -101,29 +92,9 @@ class Scores:
         return {
             "dataset": self.root,
             "reward": self.reward,
-            "auc": self.auc,
             "bar": bar,
             "episodes": episodes,
         }
-
-
-def roc_auc(scores: F64, succeeded: NDArray[np.bool_]) -> float | None:
-    """Return P(a failed episode's score is below a successful one's).
-
-    Ties count half (Mann and Whitney 1947).
-
-    Args:
-        scores: Scores of the episodes, (E,).
-        succeeded: Whether each episode succeeded, (E,).
-
-    Returns:
-        The probability; None if all or none of the episodes succeeded.
-    """
-    if succeeded.all() or not succeeded.any():
-        return None
-    good, bad = scores[succeeded], scores[~succeeded]
-    found: Any = mannwhitneyu(good, bad, method="asymptotic")
-    return float(found.statistic / (len(good) * len(bad)))
 
 
 def write_weights(path: Path, scores: Scores) -> None:
@@ -166,14 +137,9 @@ def worst_table(scores: Scores) -> Table:
 
 
 def fact_lines(scores: Scores) -> list[str]:
-    """Return lines that say how many episodes are kept, and how well the score detects failed
-    episodes.
-    """
+    """Return a line that says how many episodes are kept."""
     kept, count = int((scores.episodes > scores.bar).sum()), len(scores.episodes)
-    lines = [
+    return [
         f"{kept:,} of {count:,} episodes score more than {scores.bar:.2f}; frames of the others"
         " have weight 0"
     ]
-    if scores.auc is not None:
-        lines.append(f"area under the ROC curve for detecting failed episodes: {scores.auc:.3f}")
-    return lines

@@ -14,18 +14,16 @@ each state. Several policies are (..., H, S).
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.mdp import F64, I64
+from manip_il.mdp import F64
 from manip_il.seeding import rng_for
 
 PLACES = 100  # states that the expert visits
 RIGHT, WRONG = 0, 1  # the expert's action in every state, and the other one
-_BELOW_1 = 1 - 1e-9  # keeps a random number below 1 after rounding
 HORIZONS = (10, 20, 40, 80, 160, 320, 640)
 # mean error of a policy times the horizon, small enough that the gap does not saturate
 ERROR = 0.03
@@ -90,38 +88,21 @@ class Process:
             now = (now - wrong) @ self.moves[RIGHT] + wrong @ self.moves[WRONG]
         return found
 
-    @cached_property
-    def _successors(self) -> I64:
-        """States that an action leads to, each as likely as the others, (2, S, K)."""
-        size = np.lcm.reduce((self.moves > 0).sum(axis=2).ravel())
-        return np.array(
-            [
-                [np.repeat(np.flatnonzero(row), size // np.count_nonzero(row)) for row in rows]
-                for rows in self.moves
-            ]
-        )
+    def seen(self, policy: F64, count: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+        """Draw which states are visited by at least one of `count` trajectories of each policy.
 
-    def seen(self, policy: F64, count: int, rngs: list[np.random.Generator]) -> NDArray[np.bool_]:
-        """Return which states are visited by at least one of a policy's trajectories.
+        The probability of a visit, 1 - (1 - p)^count, is exact for every state and step; the draws
+        are independent of each other.
 
         Args:
-            policy: Probability of a wrong action of each policy, (B, H, S).
+            policy: Probability of a wrong action of each policy, (..., H, S).
             count: Number of trajectories per policy.
-            rngs: One generator per policy, which draws its trajectories.
+            rng: Draws the visits.
 
         Returns:
-            Whether a state is visited at a step, (B, H, S).
+            Whether a state is visited at a step, (..., H, S).
         """
-        (batch, horizon, _), leads = policy.shape, self._successors
-        now = np.stack([rng.choice(self.states, count, p=self.start) for rng in rngs])
-        chances = np.stack([rng.random((horizon, 2, count)) for rng in rngs])
-        found, rows = np.zeros(policy.shape, np.bool_), np.arange(batch)[:, None]
-        for t in range(horizon):
-            found[rows, t, now] = True
-            action = (1 - policy[rows, t, now] <= chances[:, t, 0]).astype(np.int64)
-            way = (chances[:, t, 1] * _BELOW_1 * leads.shape[2]).astype(np.int64)
-            now = leads[action, now, way]
-        return found
+        return rng.random(policy.shape) >= (1 - self.visits(policy)) ** count
 
 
 def _walk(back: bool) -> tuple[F64, F64, F64]:
@@ -260,9 +241,7 @@ def clone(process: Process, seen: NDArray[np.bool_]) -> F64:
     return np.where(seen | (process.wrong_costs(seen.shape[-2]) <= 0), 0.0, 1.0)
 
 
-def dagger(
-    process: Process, seen: NDArray[np.bool_], count: int, rngs: list[np.random.Generator]
-) -> F64:
+def dagger(process: Process, seen: NDArray[np.bool_], count: int, rng: np.random.Generator) -> F64:
     """Return DAgger's policies.
 
     Each is the policy of the round with the fewest errors in its own states (Definition 8.2).
@@ -271,7 +250,7 @@ def dagger(
         process: The process.
         seen: Whether states have labels from the expert's own trajectories, (B, H, S).
         count: Trajectories per round.
-        rngs: One generator per policy, see `Process.seen`.
+        rng: Draws the trajectories, see `Process.seen`.
 
     Returns:
         Probability of a wrong action of each policy, (B, H, S).
@@ -283,7 +262,7 @@ def dagger(
         better = errors < least
         best[better], least[better] = policy[better], errors[better]
         if round_ < ROUNDS:
-            seen = seen | process.seen(policy, count, rngs)
+            seen = seen | process.seen(policy, count, rng)
     return best
 
 
@@ -291,14 +270,12 @@ def _fitted(process: Process, horizon: int, draws: int) -> dict[Learner, F64]:
     """Cloning's and DAgger's policies from equally many trajectories, which leave about ERROR /
     H of states unseen.
     """
-    rngs = [
-        rng_for(draw, f"trajectories of {horizon} steps, {process.name}") for draw in range(draws)
-    ]
+    rng = rng_for(0, f"trajectories of {horizon} steps, {process.name}")
     count = int(np.ceil(PLACES * np.log(horizon / ERROR)))
     first = round(count / (1 + ROUNDS / MORE))
     expert = np.zeros((draws, horizon, process.states))
-    for_clone, for_dagger = (process.seen(expert, number, rngs) for number in (count, first))
+    for_clone, for_dagger = (process.seen(expert, number, rng) for number in (count, first))
     return {
         "cloning": clone(process, for_clone),
-        "DAgger": dagger(process, for_dagger, first // MORE, rngs),
+        "DAgger": dagger(process, for_dagger, first // MORE, rng),
     }

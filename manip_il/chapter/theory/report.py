@@ -8,7 +8,7 @@ import numpy as np
 
 from manip_il.chapter.theory.bounds import DRAWS, ERROR, PROCESSES, LossCurve
 from manip_il.chapter.theory.linear import GUST, OPEN_LOOPS, Drift
-from manip_il.chapter.theory.shift import WRONG, RoundShift, Shift
+from manip_il.chapter.theory.shift import WRONG, Shift
 from manip_il.evaluation.intervals import format_percent
 from manip_il.evaluation.report import (
     CLONING,
@@ -26,8 +26,6 @@ from manip_il.evaluation.report import (
 FILE_NAME = "theory.json"
 _LOOKS = {"cloning": (CLONING, "o"), "DAgger": (DAGGER, "s")}
 _RANGE = (1e-7, 100)  # of the distances on the logarithmic axis
-_POINTS = 1_500  # most points per cloud
-_DATA = "#b9bfc6"
 
 
 @dataclass(frozen=True)
@@ -232,28 +230,4 @@ def _arm(shift: Shift) -> list[Section]:
                 ),
             ),
         ),
-        Section(
-            "Distribution shift: positions of the hand",
-            figures=(_clouds_figure(shift.rounds),),
-            notes=("Grey: the policy's training data. Colour: the policy's own rollouts.",),
-        ),
     ]
-
-
-def _clouds_figure(rounds: Sequence[RoundShift]) -> Figure:
-    """Positions of the hand in the data and in the policy's rollouts, seen from above, by round."""
-    shown = [*rounds[:3], *rounds[3:][-1:]]  # early rounds differ most
-    with drawing(len(shown), size=(9.0 / len(shown), 3.0), sharex="row", sharey="row") as (
-        drawn,
-        axes,
-    ):
-        for axis, one in zip(axes[0], shown, strict=True):
-            own = CLONING if one.round == 0 else DAGGER
-            for places, colour in ((one.data, _DATA), (one.hand, own)):
-                x, y, _ = places[:: max(1, len(places) // _POINTS)].T
-                axis.scatter(y, x, s=2.5, color=colour, alpha=0.55, lw=0, rasterized=True)
-            axis.set(title=one.name, xlabel="y [m]", ylabel="x [m]", aspect="equal")
-        axes[0, 0].invert_xaxis()
-        return to_figure(
-            drawn, "Positions of the hand in the data and in the policy's rollouts, by round"
-        )

@@ -1,8 +1,8 @@
 """Distribution shift on an arm, measured for every round of a DAgger run.
 
-For each round's policy: how often it errs in the expert's states and in its own, where its hand and
-that of its training data were, and how much more it costs than the expert, compared with Theorem
-8.2's bound. Costs are control steps until the task is solved, or the horizon if it is not.
+For each round's policy: how often it errs in the expert's states and in its own, and how much more
+it costs than the expert, compared with Theorem 8.2's bound. Costs are control steps until the task
+is solved, or the horizon if it is not.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,6 @@ from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.data.dataset import joined_columns
 from manip_il.data.lerobot_layout import EPISODE_INDEX
 from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import Proportion
@@ -31,7 +30,6 @@ from manip_il.worlds.table import described_env, env_spec
 EPISODES = 50  # episodes of the expert and of each round's policy
 # an action is wrong if any joint is off the label by more than this share of its largest step
 WRONG = 0.25
-_HAND = ("ee.x", "ee.y", "ee.z")
 _COLUMNS = (
     schema.STATE,
     schema.ENVIRONMENT_STATE,
@@ -43,8 +41,8 @@ Columns = dict[str, NDArray[Any]]
 OnEpisode = Callable[[Episode], None]
 
 
-# number, `pretrained_model` folder, training datasets
-RoundData = tuple[int, Path, tuple[Path, ...]]
+# number, `pretrained_model` folder
+RoundData = tuple[int, Path]
 
 
 @dataclass(frozen=True)
@@ -61,8 +59,6 @@ class RoundShift:
         cost: Mean cost [control steps].
         gap: Excess of the cost over the expert's [control steps].
         bound: Theorem 8.2's bound on the gap, u times `mistakes` [control steps].
-        data: Positions of the hand in the training data, (N, 3) [m].
-        hand: Positions of the hand in the policy's rollouts, (N, 3) [m].
     """
 
     round: int
@@ -73,8 +69,6 @@ class RoundShift:
     cost: float
     gap: float
     bound: float
-    data: F64
-    hand: F64
 
     @property
     def name(self) -> str:
@@ -82,7 +76,7 @@ class RoundShift:
         return "cloning (round 0)" if self.round == 0 else f"round {self.round}"
 
     def to_json(self) -> dict[str, Any]:
-        """Return all numbers except the positions."""
+        """Return all numbers."""
         names = ("round", "on_expert", "on_own", "mistakes", "cost", "gap", "bound")
         success = {"success": self.success.rate, "interval": list(self.success.interval)}
         return {name: getattr(self, name) for name in names} | success
@@ -105,7 +99,7 @@ class Shift:
     rounds: tuple[RoundShift, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Return all numbers except the positions."""
+        """Return all numbers."""
         return {
             "robot": env_spec(self.env).robot,
             "task": env_spec(self.env).task,
@@ -117,16 +111,14 @@ class Shift:
 
 
 def find_rounds(run: Path) -> list[RoundData]:
-    """Return the rounds of a run that have a policy and training data.
+    """Return the rounds of a run that have a policy.
 
     Raises `ManipError` if there is none.
     """
-    found, datasets = list[RoundData](), list[Path]()
+    found = list[RoundData]()
     for folder in sorted(run.glob("round_[0-9][0-9][0-9]")):
-        datasets += folder.glob("dataset")
         for policy in folder.glob("policy/checkpoints/last/pretrained_model"):
-            if datasets:
-                found.append((int(folder.name[-3:]), policy, tuple(datasets)))
+            found.append((int(folder.name[-3:]), policy))
     if not found:
         raise ManipError(
             f"{run} has no round with a policy; expected the folder of a run of manip-il dagger"
@@ -160,16 +152,14 @@ def measure_shift(
         The rounds' errors in the expert's states and in their own, with costs and bounds.
     """
     seeds, scale = stream_seeds("theory", episodes), described_env(env).actions.scale
-    spec, found = env_spec(env), list[RoundShift]()
-    hand = [spec.environment_state_names.index(name) for name in _HAND]
+    found = list[RoundShift]()
     plain = RolloutJob(env, hold=0, conditions=conditions)
     expert, expert_cost, _ = _run(engine, plain, seeds, on_episode)
-    for number, path, datasets in rounds:
+    for number, path in rounds:
         own, cost, success = _run(
             engine, replace(plain, driver=PolicyDriver.of(path)), seeds, on_episode
         )
         policy = LearnedPolicy.load(path)
-        data = joined_columns(datasets, [schema.ENVIRONMENT_STATE])[schema.ENVIRONMENT_STATE]
         wrong = _is_wrong(own[schema.EXECUTED_ACTION], own, scale)
         on_expert = (
             None
@@ -187,8 +177,6 @@ def measure_shift(
                 cost=cost,
                 gap=cost - expert_cost,
                 bound=u * mistakes,
-                data=data[:, hand],
-                hand=own[schema.ENVIRONMENT_STATE][:, hand],
             )
         )
     return Shift(env, expert_cost, u, tuple(found))

@@ -28,7 +28,7 @@ from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.errors import ManipError, UnknownName, UsageError, warn
 from manip_il.evaluation.comparison import FILE_NAME, Comparison, Study
 from manip_il.evaluation.eval_report import compare_report, run_report, success_table
-from manip_il.evaluation.film import collect_films, film_episode, run_states
+from manip_il.evaluation.film import collect_films, film_episode
 from manip_il.evaluation.measuring import episode_hold, measure_sides, open_driver
 from manip_il.evaluation.report import REPORT_FILE, Film
 from manip_il.evaluation.side import (
@@ -200,7 +200,7 @@ def _film(sides: Sequence[Side], config: RunConfig, stages: Stages) -> list[Film
     def films() -> Iterator[Film]:
         for side in sides:
             env, driver, _ = open_driver(side.members[0].policy, config.env)
-            episode = run_states(RolloutJob(env, driver, episode_hold(env)), seed)
+            [episode] = RolloutJob(env, driver, episode_hold(env), label="last").run([seed])
             caption = f"{'success' if episode.success else 'failure'}, seed {seed}"
             yield film_episode(env, episode, side.name, caption)
 
