@@ -42,7 +42,7 @@ def simulate(
     times, substeps = goals.shape[1], max(1, round(dt / STEP))
     step = dt / substeps
     stiffness = servo["stiffness"] * gain / FACTORY_GAIN
-    torque, damping, friction = servo["torque"], servo["damping"], servo["friction"]
+    damping, friction = servo["damping"], servo["friction"]
     mass = inertia + servo["armature"]
     play, offset = np.radians(servo["play"]) / 2, np.radians(servo["offset"])
     wanted = goals - np.expand_dims(offset, -1)
@@ -61,7 +61,8 @@ def simulate(
         for _ in range(substeps):
             ramp = np.clip(goal, ramp - servo["speed"] * step, ramp + servo["speed"] * step)
             at = np.clip(at, ramp - play, ramp + play)
-            force = np.clip(stiffness * (at - x) - damping * v, -torque, torque) - against
+            pull = stiffness * (at - x) - damping * v
+            force = np.clip(pull, -servo["torque"], servo["torque"]) - against
             free, stop = v + step * force / mass, step * friction / mass
             v = np.where(np.abs(free) <= stop, 0.0, free - np.sign(free) * stop)
             x = x + step * v

@@ -11,7 +11,7 @@ from manip_il.calibrate.joint import simulate
 from manip_il.mdp import F64
 from manip_il.serve.config import ServoConfig, SessionConfig
 from manip_il.serve.station import Station
-from manip_il.worlds.ladder.world import env_of
+from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import make_config
 
 DT = 1 / 480  # [s]
@@ -59,7 +59,7 @@ def test_a_joint_at_rest_is_within_friction_and_play_of_its_goal():
 
 
 def test_it_moves_as_the_arm_that_is_served(tmp_path: Path):
-    station = Station(env_of(make_config("so101", "lift")), SessionConfig(output_dir=tmp_path))
+    station = Station(LadderEnv(make_config("so101", "lift")), SessionConfig(output_dir=tmp_path))
     station.reset(1)
     env, bus = station.env, station.buses["follower"]
     full = np.zeros((env.world.model.nv,) * 2)
