@@ -144,7 +144,7 @@ def shorten(value: object) -> str:
 def warn(*lines: str) -> None:
     """Log warnings, one line each, which the command line prints on standard error."""
     for line in lines:
-        logging.getLogger("manip_il").warning("%s", line)
+        logging.getLogger("manip_il").warning("%s", printable(line))
 
 
 def silence_ffmpeg_warning() -> None:
