@@ -113,11 +113,6 @@ def write(
     return root
 
 
-def rows_of(dataset: Dataset, episode: int) -> np.ndarray:
-    """The rows of an episode, (T,)."""
-    return np.arange(dataset.episodes.start[episode], dataset.episodes.stop[episode])
-
-
 def read_episodes(root: Path) -> Iterator[Episode]:
     """The episodes of a dataset with our columns, in order, as they were written."""
     dataset = Dataset.open(root)
@@ -125,7 +120,7 @@ def read_episodes(root: Path) -> Iterator[Episode]:
     names = [key for key in shapes if key not in dataset.spec.image_keys]
     for number, one in enumerate(dataset.stored_episodes(names)):
         columns = {
-            key: dataset.frames(key, rows_of(dataset, number)) for key in dataset.spec.image_keys
+            key: dataset.frames(key, dataset.rows_of(number)) for key in dataset.spec.image_keys
         }
         columns |= {key: one.columns[key].reshape(-1, *shapes[key]) for key in names}
         solved, drawn = columns[s.SUCCESS], json.loads(one.others[lerobot_layout.DRAWN] or "{}")
@@ -161,7 +156,7 @@ def assert_comes_back(root: Path, episodes: list[Episode]) -> None:
 def episode_frames(root: Path, key: str, episode: int) -> np.ndarray:
     """An episode's pictures of one camera, decoded, (T, height, width, 3)."""
     dataset = Dataset.open(root)
-    return dataset.frames(key, rows_of(dataset, episode))
+    return dataset.frames(key, dataset.rows_of(episode))
 
 
 def video_rows(root: Path) -> dict[Path, int]:

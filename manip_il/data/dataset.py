@@ -295,6 +295,16 @@ class Dataset:
         """Return a camera's decoded pictures, (B, height, width, 3), of these rows, (B,)."""
         return self.camera(key).rows(rows)
 
+    def rows_of(self, episode: int) -> I64:
+        """Return the rows of an episode, (T,). Raises `UsageError` if it does not exist."""
+        if not 0 <= episode < self.info.episodes:
+            raise UsageError(
+                f"{self.root} has no episode {episode}; it has 0 to {self.info.episodes - 1}"
+            )
+        table = self.episodes
+        [place] = np.flatnonzero(table.index == episode)[:1]
+        return np.arange(table.start[place], table.start[place] + table.length[place])
+
     @property
     def stored_features(self) -> layout.Features:
         """The features in `info.json`, with everything that it says of them, without LeRobot's

@@ -18,7 +18,7 @@ from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 
 from ..damage import DATA, EPISODES, cut, edit_json, edit_table
-from ..pictures import encoded, rows_of
+from ..pictures import encoded
 from .teaching import EPISODES as COUNT
 from .teaching import encode, make
 
@@ -32,7 +32,7 @@ def move(
     """Change state and action, (T, 5) each, of these episodes in place."""
     dataset = Dataset.open(root)
     columns = {key: values.copy() for key, values in dataset.columns([s.STATE, s.ACTION]).items()}
-    for rows in (rows_of(dataset, one) for one in episodes):
+    for rows in map(dataset.rows_of, episodes):
         change(*(columns[key][rows[0] : rows[-1] + 1] for key in (s.STATE, s.ACTION)))
     edit_table(
         root / DATA, lambda table: table.update({key: one.tolist() for key, one in columns.items()})
@@ -175,7 +175,7 @@ def cameras(root: Path, rng: Rng) -> str | None:
         return None
     seen = {key: dataset.frames(key, np.arange(len(dataset))).copy() for key in dataset.cameras}
     left, right = seen.values()
-    for part in (rows_of(dataset, one) for one in some(rng)):
+    for part in map(dataset.rows_of, some(rng)):
         if what == "is swapped with":
             left[part], right[part] = right[part].copy(), left[part].copy()
         else:
