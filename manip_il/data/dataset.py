@@ -36,7 +36,7 @@ from manip_il.data.parquet_files import (
     to_numpy,
 )
 from manip_il.data.statistics import Statistics, column_statistics, pool, read_statistics
-from manip_il.errors import ManipError, UnknownName
+from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import I64
 
 UNKNOWN_TASK = UNKNOWN_ROBOT = "unknown"
