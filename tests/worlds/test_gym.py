@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 import manip_il
+from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.rounds import round_scenes
 from manip_il.cli.main import main
 from manip_il.collect.edits import EditTarget, open_source, relabel_dataset
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import run_there
 from manip_il.data.dataset import Dataset
-from manip_il.data.schema import SIM_STATE
 from manip_il.errors import ManipError, UsageError
-from manip_il.mdp import State
+from manip_il.learn.fit_config import FitConfig
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.gym.environment import GymEnv
@@ -170,21 +171,11 @@ def test_pictures_are_of_the_state_alone(tmp_path):
     assert not np.array_equal(one, other.observe().images["render"])
 
 
-@pytest.mark.gl
-@pytest.mark.slow
 def test_dagger_from_pictures_draws_the_states_as_visited(tmp_path):
-    (tmp_path / "own.py").write_text(REACHER)
-    run = tmp_path / "run"
-    words = [f"--env.type={tmp_path / 'own.py'}", "--policy.type=cnn", "--policy.width=16"]
-    words += ["--image.height=32", "--image.width=48", "--redraw=12", "--demonstrations=2"]
-    words += ["--rounds=1", "--episodes_per_round=1", "--steps=2", "--batch_size=4", "--workers=1"]
-    assert main(["dagger", *words, "--validation_episodes=1", f"--output_dir={run}"]) == 0
-    visited, drawn = (
-        [State.from_vector(row).physics.tobytes() for row in one.columns([SIM_STATE])[SIM_STATE]]
-        for one in (Dataset.open(run / "round_000" / name) for name in ("dataset", "redrawn"))
-    )
-    assert len(drawn) == 12
-    assert set(drawn) <= set(visited)
+    env, cameras = config(tmp_path, REACHER), CameraConfig(("render",), 32, 48)
+    manip_il.record(tmp_path / "demos", env, 1, workers=1)
+    run = RunConfig(env, fit=FitConfig(policy={"type": "cnn"}), cameras=cameras, redraw=12)
+    assert not round_scenes(run, [tmp_path / "demos"]).anew
 
 
 @pytest.mark.parametrize(
