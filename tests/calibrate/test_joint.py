@@ -19,16 +19,15 @@ SECONDS = 1.5
 PAN = 0  # the joint about the vertical, on which gravity does not act
 
 
-def moved(goals: F64, gain: float = 16, **servo: float) -> F64:
-    """Return the positions of a joint without load that starts at 0, (T,) [rad]."""
-    parameters = {name: np.array(value) for name, value in asdict(ServoConfig(**servo)).items()}
+def moved(goals: F64, start: float = 0.0, inertia: float = 0.01, **servo: float) -> F64:
+    """Return the positions of a joint without load at P_Coefficient 16, (T,) [rad]."""
     return simulate(
-        parameters,
+        {name: np.array(value) for name, value in asdict(ServoConfig(**servo)).items()},
         goals[None],
-        np.zeros(1),
+        np.array([start]),
         DT,
-        gain=np.array(gain),
-        inertia=np.array([0.01]),
+        gain=np.array(16),
+        inertia=np.array([inertia]),
         load=lambda sample, x: 0 * x,
     )[0]
 
@@ -82,13 +81,6 @@ def test_it_moves_as_the_arm_that_is_served(tmp_path: Path):
     station.run(each_step)
     station.close()
     every = env.config.physics_steps
-    expected = simulate(
-        {name: np.array(value) for name, value in asdict(ServoConfig()).items()},
-        np.r_[start, np.full(45 * every, start + goal)][None],
-        np.array([start]),
-        DT,
-        gain=np.array(16),
-        inertia=np.array([inertia]),
-        load=lambda sample, x: 0 * x,
-    )[0]
-    assert np.abs(np.array(seen[1:]) - expected[::every][: len(seen) - 1]).max() < 0.03
+    goals = np.r_[start, np.full(45 * every, start + goal)]
+    expected = moved(goals, start, inertia)[::every]
+    assert np.abs(np.array(seen[1:]) - expected[: len(seen) - 1]).max() < 0.03
