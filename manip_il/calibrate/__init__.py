@@ -1,1 +1,1 @@
-"""What a simulated arm needs to know of a real one, found in a recorded dataset."""
+"""A real arm as equations, to compare with what was recorded of it."""

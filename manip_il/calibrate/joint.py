@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -39,7 +40,7 @@ def simulate(
     Returns:
         Positions at every sample, (L, T) [rad].
     """
-    times, substeps = goals.shape[1], max(1, round(dt / STEP))
+    times, substeps = goals.shape[1], math.ceil(dt / STEP - 1e-9)
     step = dt / substeps
     stiffness = servo["stiffness"] * gain / FACTORY_GAIN
     damping, friction = servo["damping"], servo["friction"]

@@ -31,6 +31,8 @@ IN_A_FILE = 3  # episodes written to a file by default
 class ViewOptions(Tested, Seeded, Trusting):
     """Watch a robot at its task in MuJoCo's viewer, or write what happens to a file of Rerun's.
 
+    The expert drives unless a policy is given.
+
     In the viewer, episodes run in real time until --n_episodes have ended, the window is closed or
     Ctrl-C is pressed. --output writes pictures, joints, actions, phase and progress as fast as
     possible to a file, which `rerun FILE.rrd` opens on any machine, and `rerun --web-viewer

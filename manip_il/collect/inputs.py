@@ -9,9 +9,11 @@ from typing import Any
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import check_same_spec
-from manip_il.errors import UsageError, warn
+from manip_il.errors import UnknownName, warn
 from manip_il.learn.checkpoint import Checkpoint, Origin
+from manip_il.sim.shape import MESH
 from manip_il.worlds.config import EnvConfig
+from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.worlds.table import (
     complete,
     env_fingerprint,
@@ -56,6 +58,16 @@ def open_dataset(root: Any) -> Dataset:
     return dataset
 
 
+def named_env(spec: EnvironmentSpec) -> EnvConfig | None:
+    """Return the environment that a dataset names; None if it was made with a file of the user's
+    own, of which only the name is stored.
+    """
+    try:
+        return None if spec.object.startswith(f"{MESH}:") else stored_config(spec)
+    except UnknownName:
+        return None
+
+
 def differences(dataset: Dataset) -> list[str]:
     """Return a line for each difference in versions or model between a dataset and this machine.
 
@@ -63,9 +75,7 @@ def differences(dataset: Dataset) -> list[str]:
     or mesh is not compared, because it holds only the name of it.
     """
     spec, name = dataset.spec, str(dataset.root)
-    try:
-        env = stored_config(spec)
-    except UsageError:
+    if (env := named_env(spec)) is None:
         return []
     check_same_spec(name, spec, "this program", env_spec(env))
     # Tolerance and horizon do not affect learning, and a dataset does not hold them; pictures are

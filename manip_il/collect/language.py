@@ -152,7 +152,6 @@ class EpisodeTexts:
             for key, camera in spec.keypoint_keys.items()
             if key in columns
         }
-        # older datasets also have points of objects, `cube.corner_0`
         nouns = {name: env.noun(name) for name in spec.keypoints if "." not in name}
         return cls(
             spec,

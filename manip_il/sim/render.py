@@ -9,9 +9,11 @@ from __future__ import annotations
 import atexit
 import math
 import os
-from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+import weakref
+from collections.abc import Sequence
+from functools import lru_cache
 from importlib import import_module
+from itertools import product
 from typing import Any, NamedTuple
 
 import mujoco
@@ -196,7 +198,7 @@ def pictures(
     Raises:
         RenderError: If there is no off-screen OpenGL; it says what to unset or install.
     """
-    renderer = _renderer(scene, cameras.look)
+    renderer = _prepared(scene, cameras.look)
     renderer.pose(data, scene.nominal if variation is None else variation)
     return {name: renderer.picture(name, cameras.size, axes=axes) for name in cameras.names}
 
@@ -216,7 +218,7 @@ def projections(scene: Scene, cameras: CameraConfig, points: F64) -> dict[str, F
     Raises:
         RenderError: If there is no off-screen OpenGL.
     """
-    renderer = _renderer(scene, cameras.look)
+    renderer = _prepared(scene, cameras.look)
     return {
         name: renderer.project(name, points, cameras.width / cameras.height)
         for name in cameras.names
@@ -228,29 +230,10 @@ def close() -> None:
     if _context.own.cache_info().currsize:
         gl = _context()
         gl.make_current()
-        _prepared.own.cache_clear()
+        for canvas in list(gl.canvases):
+            canvas.free()
         gl.free()
         _context.own.cache_clear()
-
-
-def in_context[T](prepare: Callable[[], T]) -> T:
-    """Make this thread's OpenGL context current, and return what `prepare` makes in it.
-
-    Raises:
-        RenderError: If there is no off-screen OpenGL.
-    """
-    try:
-        _context().make_current()
-        return prepare()
-    except Exception as error:  # mujoco raises many kinds of errors, from ImportError to its own
-        raise RenderError(
-            f"no off-screen OpenGL ({type(error).__name__}: {error}); {REMEDY}"
-        ) from error
-
-
-def _renderer(scene: Scene, look: Look) -> _Renderer:
-    """The renderer that was used last, or a new one in its place."""
-    return in_context(partial(_prepared, scene, look))
 
 
 @cached_per_thread()
@@ -264,6 +247,7 @@ def _context() -> Any:
     # its destructor needs it even if its constructor failed
     setattr(made_by, "_context", None)  # noqa: B010
     gl = made_by(1, 1)  # any size will do, as pictures have a buffer of their own
+    gl.canvases = weakref.WeakSet()
     atexit.register(close)
     return gl
 
@@ -274,10 +258,13 @@ def _prepared(scene: Scene, look: Look) -> _Renderer:
 
 
 class Canvas:
-    """Draws one model, in pictures of any size. Needs a current OpenGL context.
+    """Draws one model, in pictures of any size, in this thread's OpenGL context.
 
     Args:
         model: The model to draw, in which its lamps and the size of its shadow map are set.
+
+    Raises:
+        RenderError: If there is no off-screen OpenGL; it says what to unset or install.
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -286,10 +273,29 @@ class Canvas:
         self._scene: Any = mujoco.MjvScene(model, _MAX_GEOMS)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._context: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        if self._context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN:
-            raise RuntimeError("the context has no off-screen buffers")
+        self._context: Any = None
+        self._enter()
+
+    def _enter(self) -> None:
+        """Draw into this canvas from now on, whatever else has drawn since."""
+        try:
+            gl = _context()
+            gl.make_current()
+            if self._context is None:
+                self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+                gl.canvases.add(self)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+            if self._context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN:
+                raise RuntimeError("the context has no off-screen buffers")
+        except Exception as error:  # mujoco raises many kinds of errors, from ImportError on
+            raise RenderError(
+                f"no off-screen OpenGL ({type(error).__name__}: {error}); {REMEDY}"
+            ) from error
+
+    def free(self) -> None:
+        """Free what the current OpenGL context holds of the canvas. It is made again if needed."""
+        self._context.free()
+        self._context = None
 
     def pose(self, data: mujoco.MjData) -> None:
         """Take the poses from `data`."""
@@ -311,6 +317,7 @@ class Canvas:
             props: Objects that are not in the model.
             axes: Whether to draw the axes of the site `ee`.
         """
+        self._enter()
         height, width = (_FINER * side for side in size)
         most_wide, most_high = self._context.offWidth, self._context.offHeight
         if height > most_high or width > most_wide:  # pictures of all sizes share one buffer
@@ -368,20 +375,30 @@ class _Renderer:
         return self._canvas.project(self._cameras[camera], points, aspect)
 
 
+_SIGNS = np.array(list(product((-1, 1), repeat=3)))  # signs of a box's corners
 _NAMED = (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_SITE)
+_CORNERS = 4  # a box's upper corners, which cameras see
 
 
 def points_in(world: World) -> dict[str, F64]:
     """Return the keypoints: name -> position (3,) [m].
 
-    A vector that the task observes is a keypoint if it has the name of a body, geom or site.
+    A vector that the task observes is a keypoint if it has the name of a body, geom or site. The
+    upper corners of a box are numbered by their direction from its centre, seen from above.
     """
     model = world.scene.model
-    return {
+    found = {
         name: np.asarray(value)
         for name, value in world.scene.task.observe(world).items()
         if np.ndim(value) and any(mujoco.mj_name2id(model, kind, name) >= 0 for kind in _NAMED)
     }
+    for name, one in world.scene.objects.items():
+        if model.geom_type[one.geom] == mujoco.mjtGeom.mjGEOM_BOX:
+            found |= {
+                f"{name}.corner_{number}": at
+                for number, at in enumerate(_upper_corners(world, name))
+            }
+    return found
 
 
 @lru_cache(SCENES_KEPT)
@@ -390,3 +407,11 @@ def point_names(scene: Scene) -> tuple[str, ...]:
     world = World(scene)
     world.update()
     return tuple(points_in(world))
+
+
+def _upper_corners(world: World, name: str) -> F64:
+    """The upper corners (4, 3) [m] of a box."""
+    pose, half = world.pose(name), np.asarray(world.extents(name)) / 2
+    around = (_SIGNS * half) @ pose.rotation.T
+    upper = around[np.argsort(around[:, 2], kind="stable")[-_CORNERS:]]
+    return pose.position + upper[np.argsort(np.arctan2(upper[:, 1], upper[:, 0]), kind="stable")]

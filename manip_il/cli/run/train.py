@@ -9,7 +9,7 @@ import os
 from manip_il.cli.imitation import RANK, TrainOptions
 from manip_il.cli.outputs import Stages, say, say_next, set_quiet
 from manip_il.cli.transfer import ExportOptions
-from manip_il.collect.inputs import open_dataset
+from manip_il.collect.inputs import named_env, open_dataset
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import Checkpoint
@@ -42,7 +42,7 @@ def run_train(options: TrainOptions) -> None:
         return
     say(f"checkpoint: {policy.path}")
     [first, *_] = datasets
-    if first.own is not None:
+    if first.own is not None and named_env(first.spec):
         say_next("eval", f"--policy.path={policy.path}", f"--output_dir={folder}/eval")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from functools import partial
 from typing import Any
 
 import mujoco
@@ -14,7 +13,7 @@ from PIL import Image
 from manip_il.caching import cached_per_thread
 from manip_il.errors import UsageError
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.render import Canvas, in_context
+from manip_il.sim.render import Canvas
 from manip_il.sim.view import simplify_meshes
 from manip_il.worlds.gym.restoring import model_arrays, simulation
 from manip_il.worlds.gym.world import GymWorld
@@ -85,8 +84,7 @@ def painted(
         camera: Name of the camera in the model.
         cameras: Size of the picture; lamps and shadows are the model's.
     """
-    painter = in_context(partial(_painter, cls, task))
-    return painter.picture(*simulated, camera, cameras.size)
+    return _painter(cls, task).picture(*simulated, camera, cameras.size)
 
 
 class _Painter:
