@@ -13,7 +13,6 @@ from manip_il.errors import UnknownName, warn
 from manip_il.learn.checkpoint import Checkpoint, Origin
 from manip_il.sim.shape import MESH
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.worlds.table import (
     complete,
     env_fingerprint,
@@ -58,12 +57,17 @@ def open_dataset(root: Any) -> Dataset:
     return dataset
 
 
-def named_env(spec: EnvironmentSpec) -> EnvConfig | None:
-    """Return the environment that a dataset names; None if it was made with a file of the user's
-    own, of which only the name is stored.
+def named_env(dataset: Dataset) -> EnvConfig | None:
+    """Return the environment that a dataset names.
+
+    None if it was recorded by others, or with a file of the user's own, of which only the name is
+    stored.
     """
+    spec = dataset.spec
     try:
-        return None if spec.object.startswith(f"{MESH}:") else stored_config(spec)
+        if dataset.own is None or spec.object.startswith(f"{MESH}:"):
+            return None
+        return stored_config(spec)
     except UnknownName:
         return None
 
@@ -75,7 +79,7 @@ def differences(dataset: Dataset) -> list[str]:
     or mesh is not compared, because it holds only the name of it.
     """
     spec, name = dataset.spec, str(dataset.root)
-    if (env := named_env(spec)) is None:
+    if (env := named_env(dataset)) is None:
         return []
     check_same_spec(name, spec, "this program", env_spec(env))
     # Tolerance and horizon do not affect learning, and a dataset does not hold them; pictures are

@@ -42,7 +42,7 @@ def run_train(options: TrainOptions) -> None:
         return
     say(f"checkpoint: {policy.path}")
     [first, *_] = datasets
-    if first.own is not None and named_env(first.spec):
+    if named_env(first):
         say_next("eval", f"--policy.path={policy.path}", f"--output_dir={folder}/eval")
 
 
