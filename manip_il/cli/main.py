@@ -81,6 +81,7 @@ COMMANDS = {
     "robot new": ("robots:RobotNewOptions", "write a first YAML file for an arm's MJCF"),
     "robot check": ("robots:RobotCheckOptions", "measure what an arm can do, before recording"),
     "robot certify": ("robots:CertifyOptions", "measure from which states the expert recovers"),
+    "robot identify": ("robots:IdentifyOptions", "find a real arm's servos from a dataset"),
     "env check": (
         "robots:EnvCheckOptions:env",
         "does a world of your own keep the contract, and how good is its expert",

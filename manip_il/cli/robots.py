@@ -2,8 +2,8 @@
 
 `manip-il serve`: a virtual SO-101 behind serial ports, for LeRobot's own programs.
 
-`manip-il robot new`, `check`, `certify`: a YAML file for your own arm, and what the arm and its
-expert can do.
+`manip-il robot new`, `check`, `certify`, `identify`: a YAML file for your own arm, what the arm and
+its expert can do, and the servos of a real one.
 """
 
 from dataclasses import MISSING, dataclass, field
@@ -125,6 +125,22 @@ class CertifyOptions(Seeded, EngineOptions, Output):
         500, "episodes for each kind of perturbation", at_least=1, at_most=1_000_000
     )
     output_dir: Path = output_folder("runs/certificate")
+
+
+@dataclass(frozen=True)
+class IdentifyOptions(Output):
+    """Find the servos of an arm from a LeRobot dataset of it.
+
+    Needs `action` and `observation.state` alone. Writes servos.yaml, which `serve --servo=` reads,
+    with a value and a 95 % interval of every parameter of every joint, and report.html. With
+    `serve --vary=servo` each world then has servos drawn from these intervals.
+
+    Example: manip-il robot identify datasets/my_arm --output_dir=runs/my_servos
+    """
+
+    dataset: Path = option(MISSING, "a dataset of an arm with servos", positional=True)
+    robot: NameOrPath = option("so101", "the arm", flag="robot.type")
+    output_dir: Path = output_folder("runs/servos")
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from manip_il.option import Seeded, option
+from manip_il.option import NameOrPath, Seeded, option
 
 if TYPE_CHECKING:
     import numpy as np
 
+STS3215, STRONG = "sts3215", "ideal"  # the servos that have names
 # values for `--servo=ideal`
 IDEAL = {
     "stiffness": 100.0,
@@ -99,8 +100,10 @@ class SessionConfig(Seeded):
         at_least=0.1,
         at_most=10,
     )
-    servo: Literal["sts3215", "ideal"] = option(
-        "sts3215", "servo model; ideal: strong and fast, without play, delay and friction"
+    servo: NameOrPath = option(
+        STS3215,
+        f"{STS3215}; {STRONG}: strong and fast, without play, delay and friction; or a file that"
+        " `robot identify` wrote",
     )
     camera_port: int = option(5599, "TCP port of the cameras (ZMQ)", at_least=1, at_most=65_535)
     reset: Literal["solved", "enter"] = option(

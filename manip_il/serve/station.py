@@ -16,10 +16,9 @@ from manip_il import checks
 from manip_il.data.atomic import write_file
 from manip_il.errors import UsageError
 from manip_il.mdp import F64, State
-from manip_il.seeding import rng_for
 from manip_il.serve.bus import STEPS, Bus, Calibration, encoder_steps
-from manip_il.serve.config import IDEAL, SessionConfig
-from manip_il.serve.servo import Follower
+from manip_il.serve.config import SessionConfig
+from manip_il.serve.servo import Follower, draw_servos
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import Scene
 from manip_il.sim.view import Clock
@@ -90,7 +89,6 @@ class Station:
         # a copy, as its motors become servos
         env.world = World(Scene(robot, env.scene.task, copy.copy(env.scene.model)))
         self.env, self._config = env, config
-        self._servos = replace(config.servos, **IDEAL) if config.servo == "ideal" else config.servos
         self._expert = LadderExpert(env.scene)
         self._step = 1 / env.config.control_hz  # [s]
         moments = env.config.control_hz * env.config.physics_steps / TICK  # a second
@@ -157,9 +155,8 @@ class Station:
         """Draw the world of a seed; follower and leader are at its start posture."""
         self.env.start(seed)
         self.seed, self._solved = seed, 0
-        self.follower.reset(
-            self._servos.varied(rng_for(seed, "servos")) if self._config.varies else self._servos
-        )
+        names = self.env.scene.robot.joint_names
+        self.follower.reset(draw_servos(self._config, names, seed))
         self._place_leader(self.env.data.qpos[self.follower.q])
         self._show()
 
@@ -200,7 +197,7 @@ class Station:
 
         Those with torque on move to their goals instead.
         """
-        bus, most = self.buses["leader"], self._servos.speed * self._step
+        bus, most = self.buses["leader"], self.follower.servos["speed"] * self._step
         wanted = np.where(bus["Torque_Enable"] > 0, bus.goals(), self._leader if q is None else q)
         self._leader = self._leader + np.clip(wanted - self._leader, -most, most)
         bus.show(self._leader)

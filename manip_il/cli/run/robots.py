@@ -1,17 +1,23 @@
-"""Run `manip-il robot new`, `check`, `certify`."""
+"""Run `manip-il robot new`, `check`, `certify`, `identify`."""
 
 import os
+from dataclasses import replace
 
 from manip_il import checks
-from manip_il.cli.outputs import OutputFile, progress, publish, say
+from manip_il.calibrate.page import advice as untold
+from manip_il.calibrate.page import identified_report, servo_table, to_yaml
+from manip_il.calibrate.servos import ROUNDS, ServoArm, identify, motions_of
+from manip_il.cli.outputs import OutputFile, about, progress, publish, say
 from manip_il.cli.robots import (
     CertifyOptions,
+    IdentifyOptions,
     RobotCheckOptions,
     RobotNewOptions,
 )
 from manip_il.collect.inputs import env_config
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_file
+from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError
 from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
 from manip_il.evaluation.robot_check import FILE_NAME as CHECK_FILE
@@ -27,6 +33,7 @@ from manip_il.robots.gripper import sweep
 from manip_il.robots.table import get_robot
 from manip_il.tasks import NAMES
 from manip_il.tasks.table import get_task
+from manip_il.worlds.ladder.world import scene_of
 
 
 def run_new(options: RobotNewOptions) -> None:
@@ -95,3 +102,20 @@ def run_certify(options: CertifyOptions) -> None:
         mu = certificate.mu
         lines = () if mu is None else (f"u of Ross et al. (2011) is at least {mu} steps",)
         publish(folder / FILE_NAME, certificate.to_json(), [certificate.table()], *lines)
+
+
+def run_identify(options: IdentifyOptions) -> None:
+    """Fit, write the servos and the page, print the table."""
+    dataset = Dataset.open(options.dataset)
+    scene = scene_of(options.robot, "reach")
+    motions = motions_of(dataset, scene)
+    with options.open() as folder:
+        arm = ServoArm(scene, dataset.fps)
+        with progress(ROUNDS, f"identify {options.dataset}") as bar:
+            joints = scene.actions.names
+            found = identify(arm, motions, joints, lambda: bar.step())
+        path = folder / "servos.yaml"
+        write_file(path, to_yaml(found).encode())
+        page = replace(identified_report(found, dataset.fps), **about(options))
+        servo_table(found).print()
+        say(*untold(found), f"servos: {path}", f"report: {page.write(folder)}")

@@ -1,0 +1,368 @@
+"""The parameters of an arm's servos, from recorded goals and positions alone.
+
+The whole arm is simulated in MuJoCo with the servos of `serve`, so that weight and coupling of the
+joints are in it. Least squares with a wide prior around the default servos finds the parameters
+(Gauss-Newton; a joint's errors are taken to depend on its own servo). The intervals hold although
+errors of neighbouring moments are alike: the scores are summed over blocks of time (the sandwich
+estimate of White 1982 and Liang & Zeger 1986).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+from numpy.typing import NDArray
+from scipy import stats
+
+from manip_il.data.dataset import Dataset
+from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.mdp import F64
+from manip_il.serve.bus import STEP
+from manip_il.serve.config import FACTORY_GAIN, ServoConfig
+from manip_il.serve.servo import PARAMETERS, set_joints, set_motors
+from manip_il.sim.config import MOST_HZ
+from manip_il.sim.world import Scene
+
+# How far servos may be from the default ones, as the standard deviation of the prior: factors
+# e^-0.7 to e^0.7 (0.5 to 2), or what is added.
+FACTOR = 0.7
+ADDED = {"play": 1.0, "delay": 0.03, "friction": 0.2}
+TOLD = 0.5  # share of the prior's deviation below which the data tell a parameter
+GAIN = 16  # P_Coefficient that LeRobot sets for a follower
+_SETTLE = 0.5  # beginning of an episode that is not compared, since its past is unknown [s]
+_BLOCK, _BLOCKS = 2.0, 40  # longest block of time [s], and how many there are at least
+ROUNDS, _NEAR, _PATIENCE = 15, 0.01, 2  # steps of the fit; it ends after two gains below 1 %
+# Steps of the derivatives in the rounds of the fit, in deviations of the prior: large at first,
+# because positions are not smooth in friction and backlash.
+_DIFFERENCES = (0.3, 0.3, 0.2, 0.2, 0.1, 0.1, 0.05)
+# Least standard deviation of a parameter, in deviations of the prior: what fits to arms whose
+# servos are known miss, although the errors of the positions are small.
+_LEAST = 0.06
+_OUTLIER = 3.0  # residuals beyond so many deviations count less (Huber)
+_LOOP = 0.012  # longest time that a recording loop needs from reading to commanding [s]
+
+
+_BOUNDS = np.array(
+    [
+        [one.metadata["at_least"], one.metadata["at_most"]]
+        for one in fields(ServoConfig)
+        if one.name in PARAMETERS
+    ]
+).T
+
+
+@dataclass(frozen=True)
+class ArmMotion:
+    """One episode of an arm.
+
+    Attributes:
+        goals: What the joints were told at every frame [rad], (T, n).
+        positions: Where they were measured at every frame [rad], (T, n).
+    """
+
+    goals: F64
+    positions: F64
+
+
+def motions_of(dataset: Dataset, scene: Scene) -> list[ArmMotion]:
+    """Return the episodes of a LeRobot dataset of a servo arm.
+
+    Args:
+        dataset: With `action` and `observation.state`, in degrees, the gripper's from 0 to 100.
+        scene: A scene of the arm.
+
+    Returns:
+        A motion an episode that is longer than a second. A joint that wraps at half a turn turns
+        on.
+
+    Raises:
+        MismatchError: If the columns are not the arm's joints.
+        UsageError: If the arm has no servos.
+        ManipError: If no episode is long enough.
+    """
+    names = [*scene.actions.names]
+    for key in ("action", "observation.state"):
+        found = dataset.features[key].table.get("names") if key in dataset.features else None
+        if found != names:
+            raise MismatchError(f"{key}: names", str(dataset.root), found, scene.robot.name, names)
+    columns = dataset.columns(["action", "observation.state"])
+    if (lerobot := scene.robot.lerobot) is None:
+        raise UsageError(f"{scene.robot.name} has no servos; expected so101 or an arm like it")
+    closed, opened = lerobot.gripper
+    angles: list[F64] = []
+    for key in ("action", "observation.state"):
+        joints = np.radians(columns[key].astype(np.float64))
+        joints[:, -1] = closed + columns[key][:, -1] / 100 * (opened - closed)
+        angles.append(joints)
+    motions: list[ArmMotion] = []
+    for start, stop in zip(dataset.episodes.start, dataset.episodes.stop, strict=True):
+        positions = np.asarray(np.unwrap(angles[1][start:stop], axis=0), float)
+        goals = angles[0][start:stop]
+        goals = goals + 2 * np.pi * np.round((positions - goals) / (2 * np.pi))
+        if len(goals) >= _BLOCK * dataset.fps:
+            motions.append(ArmMotion(goals, positions))
+    if not motions:
+        raise ManipError(f"{dataset.root} has no episode of {_BLOCK:.0f} seconds or more")
+    return motions
+
+
+def parameters(deviations: F64) -> F64:
+    """Return the parameters (..., 8) that are some prior deviations from the default, (..., 8)."""
+    default = np.array([asdict(ServoConfig())[name] for name in PARAMETERS])
+    values = default * np.exp(FACTOR * deviations)
+    for place, name in enumerate(PARAMETERS):
+        if name in ADDED:
+            values[..., place] = default[place] + ADDED[name] * deviations[..., place]
+    return np.clip(values, *_BOUNDS)
+
+
+class ServoArm:
+    """An arm with servos, as a function from their parameters to its positions.
+
+    Args:
+        scene: A scene of the arm in which it touches nothing.
+        fps: Frames per second of the motions.
+    """
+
+    def __init__(self, scene: Scene, fps: float):
+        self.fps, self._scene = fps, scene
+        self._steps = math.ceil(MOST_HZ / fps)  # physics steps in a frame
+        self._dt = 1 / (fps * self._steps)
+        self._q = np.array([*scene.arm_q, *scene.gripper.q])
+        self._ctrl = np.array([*scene.arm_ctrl, *scene.gripper.ctrl])
+        joints = [int(np.flatnonzero(scene.model.jnt_qposadr == q)[0]) for q in self._q]
+        self._dof = scene.model.jnt_dofadr[joints]
+        self._models: list[mujoco.MjModel] = []  # kept, because copies of meshes take long
+        self._threads = [mujoco.MjData(scene.model) for _ in range(2)]
+
+    def positions(self, servos: F64, motion: ArmMotion) -> F64:
+        """Simulate a motion with several sets of servos.
+
+        Args:
+            servos: Parameters in the order of `PARAMETERS`, (L, n, 8).
+            motion: Its goals, and where it starts at rest.
+
+        Returns:
+            Positions at every frame [rad], (L, T, n).
+        """
+        model, start = self._scene.model, mujoco.MjData(self._scene.model)
+        start.qpos[self._q] = motion.positions[0]
+        whole = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        state = np.empty(mujoco.mj_stateSize(model, whole))
+        mujoco.mj_getState(model, start, state, whole)
+        control = np.tile(start.ctrl, (len(servos), len(motion.goals) * self._steps, 1))
+        control[:, :, self._ctrl] = self._commands(servos, motion)
+        states, _ = rollout.rollout(
+            [self._model(lane, number) for number, lane in enumerate(servos)],
+            self._threads,
+            np.tile(state, (len(servos), 1)),
+            control,
+        )
+        places = 1 + self._q  # the time is first
+        ends = states[:, self._steps - 1 : -1 : self._steps, places]
+        first = np.broadcast_to(motion.positions[0], (len(servos), 1, len(places)))
+        return np.concatenate([first, ends], axis=1)
+
+    def _model(self, servos: F64, number: int) -> mujoco.MjModel:
+        """Return one of the arm's models, with servos (n, 8)."""
+        values = dict(zip(PARAMETERS, servos.T, strict=True))
+        if number == len(self._models):
+            self._models.append(copy.copy(self._scene.model))
+        model = self._models[number]
+        model.opt.timestep = self._dt
+        set_joints(model, self._dof, values["friction"], values["armature"])
+        gain = values["stiffness"] * GAIN / FACTORY_GAIN
+        set_motors(model, self._ctrl, gain, values["damping"], values["torque"])
+        return model
+
+    def _commands(self, servos: F64, motion: ArmMotion) -> F64:
+        """Return where the springs of the servos (L, n, 8) pull, at every physics step."""
+        values = dict(zip(PARAMETERS, np.moveaxis(servos, -1, 0), strict=True))
+        play, most = np.radians(values["play"]) / 2, values["speed"] * self._dt
+        late = values["delay"] / self._dt
+        joints = np.arange(servos.shape[1])
+        goals, frames = motion.goals, len(motion.goals)
+        ramp = at = np.broadcast_to(motion.positions[0], servos.shape[:2])
+        commands = np.empty((len(servos), frames * self._steps, servos.shape[1]))
+        for step in range(frames * self._steps):
+            # between two physics steps, so that the result is smooth in the delay
+            moment = np.maximum(step - late, 0.0)
+            before = moment.astype(int)
+            share = moment - before
+            here = goals[before // self._steps, joints]
+            there = goals[np.minimum((before + 1) // self._steps, frames - 1), joints]
+            goal = here + share * (there - here)
+            ramp = np.clip(goal, ramp - most, ramp + most)
+            at = np.clip(at, ramp - play, ramp + play)
+            commands[:, step] = at
+        return commands
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Servos as a dataset shows them.
+
+    Attributes:
+        joints: Names of the joints.
+        values: Parameters in the order of `PARAMETERS`, (n, 8).
+        low: Lower ends of the 95 % intervals, (n, 8).
+        high: Upper ends.
+        told: Whether the dataset tells a parameter; where it does not, value and interval are
+            those of the prior, (n, 8).
+        error: Mean error of the simulated positions [rad], (n,).
+        unexplained: Share of the motion's variance that is not explained, (n,).
+        measured: Positions of all motions, one after the other, (T, n) [rad].
+        simulated: The same with these servos.
+    """
+
+    joints: tuple[str, ...]
+    values: F64
+    low: F64
+    high: F64
+    told: NDArray[np.bool_]
+    error: F64
+    unexplained: F64
+    measured: F64
+    simulated: F64
+
+
+def identify(
+    arm: ServoArm,
+    motions: Sequence[ArmMotion],
+    joints: Sequence[str],
+    on_round: Callable[[], None] = lambda: None,
+) -> Identified:
+    """Find the servos with which a simulated arm moves as a recorded one.
+
+    Args:
+        arm: The arm.
+        motions: What it did.
+        joints: Names of the joints.
+        on_round: Called after every step of the fit.
+
+    Returns:
+        The parameters with their intervals.
+    """
+    z = np.zeros((len(joints), len(PARAMETERS)))
+    best = _trial(arm, motions, z, _DIFFERENCES[0])
+    damp, idle = np.full(len(joints), 1e-2), 0
+    for number in range(ROUNDS):
+        noise = _spread(best.errors)
+        before = best.cost(noise)
+        curve, score = best.equations(noise)
+        curve = curve + damp[:, None, None] * curve * np.eye(len(PARAMETERS))
+        step = np.linalg.solve(curve, score[..., None])[..., 0]
+        difference = _DIFFERENCES[min(number, len(_DIFFERENCES) - 1)]
+        trial = _trial(arm, motions, best.z + np.clip(step, -1, 1), difference)
+        after = trial.cost(noise)
+        better = after < before
+        best = best.with_joints(trial, better)
+        damp = np.clip(np.where(better, damp / 4, damp * 4), 1e-6, 1e3)
+        on_round()
+        gained = 1 - (np.minimum(after, before) / before).min()
+        idle = idle + 1 if gained < _NEAR else 0
+        if idle == _PATIENCE:
+            break
+    return _summary(best, motions, arm.fps, joints)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """Servos tried on the motions, z being their deviations from the default, (n, 8).
+
+    `errors` are those of the positions after `_SETTLE`, (N, n) [rad], `slopes` the derivatives of
+    the positions by z, (N, n, 8).
+    """
+
+    z: F64
+    errors: F64
+    slopes: F64
+    simulated: F64  # positions at every frame of all motions
+
+    def cost(self, noise: F64) -> F64:
+        """Return the negative logarithm of the posterior of every joint, (n,)."""
+        size = np.abs(self.errors) / noise
+        huber = np.where(size < _OUTLIER, size**2 / 2, _OUTLIER * (size - _OUTLIER / 2))
+        return huber.sum(0) + 0.5 * (self.z**2).sum(1)
+
+    def weights(self, noise: F64) -> F64:
+        """Return Huber's weights over the variance, (N, n)."""
+        size = np.abs(self.errors) / noise
+        return np.minimum(1, _OUTLIER / np.maximum(size, 1e-9)) / noise**2
+
+    def equations(self, noise: F64) -> tuple[F64, F64]:
+        """Return curvature (n, 8, 8) and descent direction (n, 8) of the cost."""
+        weights = self.weights(noise)
+        curve = np.einsum("ta,taj,tak->ajk", weights, self.slopes, self.slopes)
+        score = np.einsum("ta,ta,taj->aj", weights, self.errors, self.slopes)
+        return curve + np.eye(len(PARAMETERS)), score - self.z
+
+    def with_joints(self, other: _Trial, which: NDArray[np.bool_]) -> _Trial:
+        """Return this trial with some joints (n,) of another."""
+        return _Trial(
+            np.where(which[:, None], other.z, self.z),
+            np.where(which, other.errors, self.errors),
+            np.where(which[:, None], other.slopes, self.slopes),
+            np.where(which, other.simulated, self.simulated),
+        )
+
+
+def _trial(arm: ServoArm, motions: Sequence[ArmMotion], z: F64, difference: float) -> _Trial:
+    """Simulate the motions with servos and with each of their parameters changed both ways."""
+    skip, count = round(_SETTLE * arm.fps), len(PARAMETERS)
+    changes = difference * np.eye(count)[:, None]
+    lanes = parameters(np.concatenate([z[None], z + changes, z - changes]))
+    errors: list[F64] = []
+    slopes: list[F64] = []
+    simulated: list[F64] = []
+    for motion in motions:
+        positions = arm.positions(lanes, motion)
+        simulated.append(positions[0])
+        errors.append((motion.positions - positions[0])[skip:])
+        change = (positions[1 : count + 1] - positions[count + 1 :])[:, skip:] / (2 * difference)
+        slopes.append(np.moveaxis(change, 0, -1))
+    return _Trial(z, *(np.concatenate(parts) for parts in (errors, slopes, simulated)))
+
+
+def _spread(errors: F64) -> F64:
+    """Return robust standard deviations of errors (N, n) [rad], (n,); at least an encoder's."""
+    return np.maximum(1.4826 * np.median(np.abs(errors), axis=0), STEP)
+
+
+def _summary(
+    best: _Trial, motions: Sequence[ArmMotion], fps: float, joints: Sequence[str]
+) -> Identified:
+    noise = _spread(best.errors)
+    curve, _ = best.equations(noise)
+    scores = best.weights(noise)[..., None] * best.errors[..., None] * best.slopes
+    block = min(round(_BLOCK * fps), len(scores) // _BLOCKS)
+    edges = np.arange(0, len(scores), block)
+    blocks = np.add.reduceat(scores, edges)  # (B, n, 8)
+    free = len(edges) - len(PARAMETERS)
+    spread = np.einsum("baj,bak->ajk", blocks, blocks) * len(edges) / free + np.eye(len(PARAMETERS))
+    inverse = np.linalg.inv(curve)
+    variance = np.einsum("ajk,akl,alj->aj", inverse, spread, inverse)
+    deviation = np.sqrt(variance + _LEAST**2)
+    told = deviation < TOLD
+    half = float(stats.t.ppf(0.975, free)) * deviation
+    low, high = parameters(best.z - half), parameters(best.z + half)
+    delay = PARAMETERS.index("delay")
+    low[:, delay] = np.maximum(low[:, delay] - _LOOP, 0)
+    measured = np.concatenate([motion.positions for motion in motions])
+    return Identified(
+        tuple(joints),
+        parameters(best.z),
+        low,
+        high,
+        told,
+        np.abs(best.errors).mean(0),
+        best.errors.var(0) / np.maximum(measured.var(0), 1e-9),
+        measured,
+        best.simulated,
+    )
