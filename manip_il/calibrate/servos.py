@@ -35,6 +35,7 @@ FACTOR = 0.7
 ADDED = {"play": 1.0, "delay": 0.03, "friction": 0.2}
 TOLD = 0.5  # share of the prior's deviation below which the data tell a parameter
 GAIN = 16  # P_Coefficient that LeRobot sets for a follower
+_LEAST_LENGTH = 1.0  # of an episode that is used [s]
 _SETTLE = 0.5  # beginning of an episode that is not compared, since its past is unknown [s]
 _BLOCK, _BLOCKS = 2.0, 40  # longest block of time [s], and how many there are at least
 ROUNDS, _NEAR, _PATIENCE = 15, 0.01, 2  # steps of the fit; it ends after two gains below 1 %
@@ -105,10 +106,10 @@ def motions_of(dataset: Dataset, scene: Scene) -> list[ArmMotion]:
         positions = np.asarray(np.unwrap(angles[1][start:stop], axis=0), float)
         goals = angles[0][start:stop]
         goals = goals + 2 * np.pi * np.round((positions - goals) / (2 * np.pi))
-        if len(goals) >= _BLOCK * dataset.fps:
+        if len(goals) >= _LEAST_LENGTH * dataset.fps:
             motions.append(ArmMotion(goals, positions))
     if not motions:
-        raise ManipError(f"{dataset.root} has no episode of {_BLOCK:.0f} seconds or more")
+        raise ManipError(f"{dataset.root} has no episode of {_LEAST_LENGTH:.0f} second or more")
     return motions
 
 

@@ -135,7 +135,7 @@ class IdentifyOptions(Output):
     with a value and a 95 % interval of every parameter of every joint, and report.html. With
     `serve --vary=servo` each world then has servos drawn from these intervals.
 
-    Example: manip-il robot identify datasets/my_arm --output_dir=runs/my_servos
+    Example: manip-il robot identify datasets/session --output_dir=runs/my_servos
     """
 
     dataset: Path = option(MISSING, "a dataset of an arm with servos", positional=True)

@@ -16,8 +16,9 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
     "datasets/demos.journals": "record --dataset.root=datasets/demos",
     "datasets/seen": "record --cameras=front,wrist --dataset.root=datasets/seen",
     "datasets/more": "record --dataset.root=datasets/more",
-    "datasets/session.journals": (
-        "record --robot.type=so101 --task.type=lift --dataset.root=datasets/session"
+    **dict.fromkeys(
+        ("datasets/session", "datasets/session.journals"),
+        "record --robot.type=so101 --task.type=lift --dataset.root=datasets/session",
     ),
     "datasets/carry": "record --task.type=carry --dataset.root=datasets/carry",
     "runs/irl": "irl datasets/carry --output_dir=runs/irl",
