@@ -38,7 +38,8 @@ GAIN = 16  # P_Coefficient that LeRobot sets for a follower
 _LEAST_LENGTH = 1.0  # of an episode that is used [s]
 _SETTLE = 0.5  # beginning of an episode that is not compared, since its past is unknown [s]
 _BLOCK, _BLOCKS = 2.0, 40  # longest block of time [s], and how many there are at least
-ROUNDS, _NEAR, _PATIENCE = 15, 0.01, 2  # steps of the fit; it ends after two gains below 1 %
+ROUNDS = 15  # most steps of the fit
+_NEAR, _PATIENCE = 0.01, 2  # it ends after two gains below 1 %
 # Steps of the derivatives in the rounds of the fit, in deviations of the prior: large at first,
 # because positions are not smooth in friction and backlash.
 _DIFFERENCES = (0.3, 0.3, 0.2, 0.2, 0.1, 0.1, 0.05)
@@ -121,6 +122,14 @@ def parameters(deviations: F64) -> F64:
         if name in ADDED:
             values[..., place] = default[place] + ADDED[name] * deviations[..., place]
     return np.clip(values, *_BOUNDS)
+
+
+def _lowest() -> F64:
+    """Return the deviations at which added parameters are zero, (8,)."""
+    default = asdict(ServoConfig())
+    return np.array(
+        [-default[name] / ADDED[name] if name in ADDED else -np.inf for name in PARAMETERS]
+    )
 
 
 class ServoArm:
@@ -260,7 +269,8 @@ def identify(
         curve = curve + damp[:, None, None] * curve * np.eye(len(PARAMETERS))
         step = np.linalg.solve(curve, score[..., None])[..., 0]
         difference = _DIFFERENCES[min(number, len(_DIFFERENCES) - 1)]
-        trial = _trial(arm, motions, best.z + np.clip(step, -1, 1), difference)
+        z = np.maximum(best.z + np.clip(step, -1, 1), _lowest())
+        trial = _trial(arm, motions, z, difference)
         after = trial.cost(noise)
         better = after < before
         best = best.with_joints(trial, better)
