@@ -1,1 +1,1 @@
-"""A real arm as equations, to compare with what was recorded of it."""
+"""The servos of a real arm, from what was recorded of it."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from manip_il.data.dataset import Dataset
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 from manip_il.mdp import F64
 from manip_il.serve.bus import STEP
 from manip_il.serve.config import FACTORY_GAIN, ServoConfig
@@ -85,6 +85,7 @@ def motions_of(dataset: Dataset, scene: Scene) -> list[ArmMotion]:
 
     Raises:
         MismatchError: If the columns are not the arm's joints.
+        NotFiniteError: If a value is NaN or infinite.
         UsageError: If the arm has no servos.
         ManipError: If no episode is long enough.
     """
@@ -94,6 +95,9 @@ def motions_of(dataset: Dataset, scene: Scene) -> list[ArmMotion]:
         if found != names:
             raise MismatchError(f"{key}: names", str(dataset.root), found, scene.robot.name, names)
     columns = dataset.columns(["action", "observation.state"])
+    for key, column in columns.items():
+        if not np.isfinite(column).all():
+            raise NotFiniteError(f"{dataset.root}: {key} has values that are not finite")
     if (lerobot := scene.robot.lerobot) is None:
         raise UsageError(f"{scene.robot.name} has no servos; expected so101 or an arm like it")
     closed, opened = lerobot.gripper
@@ -223,8 +227,8 @@ class Identified:
         values: Parameters in the order of `PARAMETERS`, (n, 8).
         low: Lower ends of the 95 % intervals, (n, 8).
         high: Upper ends.
-        told: Whether the dataset tells a parameter; where it does not, value and interval are
-            those of the prior, (n, 8).
+        told: Whether the dataset tells a parameter, (n, 8). If it does not, its value and its
+            interval mostly follow from the prior.
         error: Mean error of the simulated positions [rad], (n,).
         unexplained: Share of the motion's variance that is not explained, (n,).
         measured: Positions of all motions, one after the other, (T, n) [rad].
@@ -352,10 +356,10 @@ def _summary(
     noise = _spread(best.errors)
     curve, _ = best.equations(noise)
     scores = best.weights(noise)[..., None] * best.errors[..., None] * best.slopes
-    block = min(round(_BLOCK * fps), len(scores) // _BLOCKS)
+    block = max(1, min(round(_BLOCK * fps), len(scores) // _BLOCKS))
     edges = np.arange(0, len(scores), block)
     blocks = np.add.reduceat(scores, edges)  # (B, n, 8)
-    free = len(edges) - len(PARAMETERS)
+    free = max(1, len(edges) - len(PARAMETERS))
     spread = np.einsum("baj,bak->ajk", blocks, blocks) * len(edges) / free + np.eye(len(PARAMETERS))
     inverse = np.linalg.inv(curve)
     variance = np.einsum("ajk,akl,alj->aj", inverse, spread, inverse)
