@@ -5,136 +5,129 @@ Usage: python benchmarks/servo_traces.py FOLDER [--fit]
 FOLDER has JSON files as github.com/kscalelabs/sysid publishes them (commit 6b78737, folder
 `data/feetech/STS_3215_12V_20250317/processed`): one servo swings a pendulum of known mass and
 length; goal and position every 5 ms, several gains and trajectories. Prints the mean error of the
-position and the lag at P_Coefficient 16, for the default servos and, with `--fit`, for parameters
-that are fitted to 60 recordings of two masses, on the other masses, in three minutes.
+position and the lag at P_Coefficient 16, for the default servos and, with `--fit`, for those that
+`identify` finds in 60 recordings of two masses, on the other masses.
 """
 
 import json
 import sys
-from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
-from scipy.optimize import least_squares
 
-from manip_il.calibrate.joint import simulate
-from manip_il.mdp import F64, I64
-from manip_il.serve.config import ServoConfig
+from manip_il.calibrate.servos import Arm, ArmMotion, ServoArm, identify
+from manip_il.mdp import F64
+from manip_il.robots.servos import GAIN, PARAMETERS, default_servo
 
-DT, SAMPLES = 0.005, 1000  # time between samples [s], samples of a recording that are used
-GRAVITY = 9.81  # [m/s^2]
+FPS, SAMPLES = 200, 1000  # samples a second, and those of a recording that are used
 TILT = -0.06  # angle at which this pendulum hangs [rad]
 FITTED = (0.535, 0.969)  # masses whose recordings are fitted [kg]
-BOUNDS = {  # of the fit
-    "stiffness": (5, 60),
-    "torque": (1, 8),
-    "damping": (0.05, 4),
-    "friction": (0, 0.5),
-    "armature": (0.001, 0.08),
-    "play": (0, 3),
-    "delay": (0, 0.05),
-    "speed": (1, 20),
-}
+PENDULUM = """<mujoco><option integrator="implicitfast"/><worldbody><body euler="{tilt} 0 0">
+<joint name="hinge" axis="1 0 0"/>
+<geom type="sphere" size="0.01" pos="0 0 -{length}" mass="{mass}"/>
+<geom type="capsule" size="0.002" fromto="0 0 0 0 0 -{length}" mass="{rod}"/>
+</body></worldbody><actuator><position joint="hinge"/></actuator></mujoco>"""
 
 
-class Traces:
-    """The recordings, and what the model makes of their goals.
+class Trace(NamedTuple):
+    """One recording.
 
-    Args:
-        folder: Folder with the recordings, at any depth.
+    Attributes:
+        kind: Name of its trajectory.
+        mass: Mass at the pendulum's end [kg].
+        gain: P_Coefficient.
+        motion: Goals and positions, (T, 1) each.
+        arm: The pendulum.
     """
 
-    def __init__(self, folder: Path):
-        every = [json.loads(path.read_bytes()) for path in sorted(folder.rglob("*.json"))]
-        kept = [
-            one
-            for one in every
-            if len(one["entries"]) >= SAMPLES and one["trajectory"] != "lift_and_drop"
-        ]
-        self.kinds = np.array([one["trajectory"] for one in kept])
-        self.mass, length, self.gain = (
-            np.array([one[key] for one in kept], float) for key in ("mass", "length", "kp")
-        )
-        rod = np.array([one.get("arm_mass", 0.0) for one in kept])
-        self._inertia = (self.mass + rod / 3) * length**2
-        self._weight = GRAVITY * (self.mass + rod / 2) * length
-        self.measured, self.goals = (
-            self._column(kept, key) for key in ("position", "goal_position")
-        )
+    kind: str
+    mass: float
+    gain: float
+    motion: ArmMotion
+    arm: ServoArm
 
-    @staticmethod
-    def _column(kept: list[dict[str, Any]], key: str) -> F64:
-        return np.array([[entry[key] for entry in one["entries"][:SAMPLES]] for one in kept])
+    def positions(self, servos: F64) -> F64:
+        """Return the positions of its goals with servos (L, 1, 8), (L, T, 1) [rad]."""
+        servos = servos.copy()  # an arm has LeRobot's gain
+        servos[..., PARAMETERS.index("stiffness")] *= self.gain / GAIN
+        return self.arm.positions(servos, self.motion)
 
-    def simulated(self, servo: Mapping[str, float], rows: I64) -> F64:
-        """Return the positions of these recordings' goals, (L, T) [rad]."""
-        weight = self._weight[rows]
-        return simulate(
-            {name: np.array(value) for name, value in servo.items()},
-            self.goals[rows],
-            self.measured[rows, 0],
-            DT,
-            gain=self.gain[rows],
-            inertia=self._inertia[rows],
-            load=lambda _, x: weight * np.sin(x + TILT),
-        )
 
-    def tell(self, name: str, positions: F64, rows: I64) -> None:
-        """Print the error and the lag of positions (L, T) [rad] of these recordings."""
-        error = np.abs(positions - self.measured[rows]).mean()
-        swings = [
-            place
-            for place, row in enumerate(rows)
-            if self.gain[row] == 16 and self.kinds[row] in ("sin_sin", "sin_time_square")
-        ]
-        lags = [_lag(self.goals[rows[place]], positions[place]) for place in swings]
-        print(f"{name:32s} {error:.4f} rad, lag at P = 16: {1e3 * np.median(lags):.0f} ms")
+class Pendulums(Arm):
+    """The pendulums of recordings as one arm, told apart by their motions."""
+
+    def __init__(self, traces: list[Trace]):
+        self.fps = FPS
+        self._traces = {id(one.motion): one for one in traces}
+
+    def positions(self, servos: F64, motion: ArmMotion) -> F64:
+        """Return the positions of a recording's goals, (L, T, 1) [rad]."""
+        return self._traces[id(motion)].positions(servos)
+
+
+def read(tree: dict[str, Any]) -> Trace:
+    """Return a recording from its JSON."""
+    goals, positions = (
+        np.array([[entry[key]] for entry in tree["entries"][:SAMPLES]])
+        for key in ("goal_position", "position")
+    )
+    xml = PENDULUM.format(
+        tilt=np.degrees(TILT),
+        length=tree["length"],
+        mass=tree["mass"],
+        rod=max(tree.get("arm_mass", 0.0), 1e-6),
+    )
+    model, first = mujoco.MjSpec.from_string(xml).compile(), np.zeros(1, int)
+    arm = ServoArm(model, first, first, FPS)
+    motion = ArmMotion(goals, positions)
+    return Trace(tree["trajectory"], float(tree["mass"]), float(tree["kp"]), motion, arm)
+
+
+def tell(name: str, traces: list[Trace], servo: F64 | None) -> None:
+    """Print the error and the lag of servos (8,); None for those that were recorded."""
+    errors, lags = list[float](), list[float]()
+    for one in traces:
+        measured = one.motion.positions[:, 0]
+        moved = measured if servo is None else one.positions(servo[None, None])[0, :, 0]
+        errors.append(float(np.abs(moved - measured).mean()))
+        if one.gain == GAIN and one.kind in ("sin_sin", "sin_time_square"):
+            lags.append(_lag(one.motion.goals[:, 0], moved))
+    lag = f", lag at P = {GAIN}: {1e3 * np.median(lags):.0f} ms" if lags else ""
+    print(f"{name:32s} {np.mean(errors):.4f} rad{lag}")
 
 
 def _lag(goal: F64, position: F64) -> float:
     goal, position = goal - goal.mean(), position - position.mean()
     errors = [np.abs(goal[: SAMPLES - late] - position[late:]).mean() for late in range(80)]
-    return DT * float(np.argmin(errors))
-
-
-def fit(traces: Traces) -> dict[str, float]:
-    """Return the parameters that fit 60 recordings of `FITTED`."""
-    rows = np.flatnonzero(np.isin(traces.mass.round(3), FITTED))
-    rows = np.random.default_rng(0).permutation(rows)[:60]
-    low, high = np.array([*BOUNDS.values()], float).T
-
-    def residuals(scaled: F64) -> F64:
-        servo = dict(zip(BOUNDS, low + scaled * (high - low), strict=True)) | {"offset": 0.0}
-        return (traces.simulated(servo, rows) - traces.measured[rows])[:, ::10].ravel()
-
-    start = [(asdict(ServoConfig())[name] - a) / (b - a) for name, (a, b) in BOUNDS.items()]
-    found = least_squares(
-        residuals, start, bounds=(0, 1), loss="soft_l1", f_scale=0.03, diff_step=1e-3, max_nfev=30
-    )
-    return dict(zip(BOUNDS, low + found.x * (high - low), strict=True)) | {"offset": 0.0}
+    return float(np.argmin(errors)) / FPS
 
 
 def main() -> None:
     """Print the table."""
-    traces = Traces(Path(sys.argv[1]))
-    every = np.arange(len(traces.mass))
-    counts = {kind: int((traces.kinds == kind).sum()) for kind in np.unique(traces.kinds).tolist()}
-    print(f"{len(every)} recordings: {counts}")
-    traces.tell("the servo itself", traces.measured, every)
-    default = {name: float(value) for name, value in asdict(ServoConfig()).items()}
-    traces.tell("manip-il serve's default", traces.simulated(default, every), every)
-    for kind in counts:
-        rows = np.flatnonzero(traces.kinds == kind)
-        error = np.abs(traces.simulated(default, rows) - traces.measured[rows]).mean()
-        print(f"  {kind:30s} {error:.4f} rad")
+    trees = [json.loads(path.read_bytes()) for path in sorted(Path(sys.argv[1]).rglob("*.json"))]
+    traces = [
+        read(tree)
+        for tree in trees
+        if len(tree["entries"]) >= SAMPLES and tree["trajectory"] != "lift_and_drop"
+    ]
+    print(f"{len(traces)} recordings")
+    tell("the servo itself", traces, None)
+    tell("manip-il serve's default", traces, default_servo())
+    for kind in sorted({one.kind for one in traces}):
+        tell(f"  {kind}", [one for one in traces if one.kind == kind], default_servo())
     if "--fit" in sys.argv:
-        servo = fit(traces)
-        print({name: round(float(value), 4) for name, value in servo.items()})
-        rest = np.flatnonzero(~np.isin(traces.mass.round(3), FITTED))
-        traces.tell("fitted, on other masses", traces.simulated(servo, rest), rest)
-        traces.tell("fitted, on all", traces.simulated(servo, every), every)
+        ours = [one for one in traces if round(one.mass, 3) in FITTED]
+        chosen = [ours[place] for place in np.random.default_rng(0).permutation(len(ours))[:60]]
+        found = identify(Pendulums(chosen), [one.motion for one in chosen], ["servo"])
+        for name, *ends in zip(
+            PARAMETERS, found.values[0], found.low[0], found.high[0], strict=True
+        ):
+            print(f"  {name}: {', '.join(f'{end:.4g}' for end in ends)}")
+        rest = [one for one in traces if round(one.mass, 3) not in FITTED]
+        tell("fitted, on other masses", rest, found.values[0])
+        tell("fitted, on all", traces, found.values[0])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What was identified of an arm, as a file of servos and as a page."""
+"""What was identified of an arm, as a robot's YAML and as a page."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from manip_il.calibrate.servos import Identified
 from manip_il.evaluation.report import Figure, Report, Section, Table, drawing, to_figure
-from manip_il.serve.servo import PARAMETERS
+from manip_il.robots.servos import PARAMETERS
 
 UNITS = ("N m/rad", "N m", "N m s/rad", "rad/s", "deg", "s", "N m", "kg m^2")
 TELLS = (  # what motion would tell a parameter
@@ -23,16 +23,21 @@ _SHOWN = 6.0  # length of a joint's worst stretch [s]
 _PANEL = (3.2, 2.4)  # [inches]
 
 
-def to_yaml(found: Identified) -> str:
-    """Return the file that `--servo=` reads: joint, parameter, value and 95 % interval."""
-    lines = ["# servos: [value, low, high] of every parameter; made by manip-il robot identify"]
+def to_yaml(found: Identified, robot: str) -> str:
+    """Return the YAML of a robot with these servos: value and 95 % interval of each parameter.
+
+    Args:
+        found: The servos.
+        robot: The robot without them, as `extends` names it.
+    """
+    lines = [f"extends: {robot}", "servos: # [value, low, high], made by manip-il robot identify"]
     for row, joint in enumerate(found.joints):
-        lines.append(f"{joint.removesuffix('.pos')}:")
+        lines.append(f"  {joint.removesuffix('.pos')}:")
         for column, name in enumerate(PARAMETERS):
             ends = (found.values, found.low, found.high)
             numbers = ", ".join(f"{end[row, column]:.5g}" for end in ends)
             untold = "" if found.told[row, column] else "; the dataset does not tell it"
-            lines.append(f"  {name}: [{numbers}] # [{UNITS[column]}]{untold}")
+            lines.append(f"    {name}: [{numbers}] # [{UNITS[column]}]{untold}")
     return "\n".join(lines) + "\n"
 
 

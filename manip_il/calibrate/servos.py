@@ -1,7 +1,7 @@
 """The parameters of an arm's servos, from recorded goals and positions alone.
 
-The whole arm is simulated in MuJoCo with the servos of `serve`, so that weight and coupling of the
-joints are in it. Least squares with a wide prior around the default servos finds the parameters
+The whole arm is simulated in MuJoCo with the servos of `sim.servo`, so that weight and coupling of
+the joints are in it. Least squares with a wide prior around the default servos finds the parameters
 (Gauss-Newton; a joint's errors are taken to depend on its own servo). The intervals hold although
 errors of neighbouring moments are alike: the scores are summed over blocks of time (the sandwich
 estimate of White 1982 and Liang & Zeger 1986).
@@ -12,7 +12,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -22,11 +23,11 @@ from scipy import stats
 
 from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
-from manip_il.mdp import F64
-from manip_il.serve.bus import STEP
-from manip_il.serve.config import FACTORY_GAIN, ServoConfig
-from manip_il.serve.servo import PARAMETERS, set_joints, set_motors
+from manip_il.mdp import F64, I64
+from manip_il.robots.robot import Robot
+from manip_il.robots.servos import BOUNDS, FACTORY_GAIN, GAIN, PARAMETERS, default_servo
 from manip_il.sim.config import MOST_HZ
+from manip_il.sim.servo import dofs_of, follow, set_joints, set_motors
 from manip_il.sim.world import Scene
 
 # How far servos may be from the default ones, as the standard deviation of the prior: factors
@@ -34,7 +35,7 @@ from manip_il.sim.world import Scene
 FACTOR = 0.7
 ADDED = {"play": 1.0, "delay": 0.03, "friction": 0.2}
 TOLD = 0.5  # share of the prior's deviation below which the data tell a parameter
-GAIN = 16  # P_Coefficient that LeRobot sets for a follower
+_ENCODER = 2 * math.pi / 4096  # resolution of positions [rad]
 _LEAST_LENGTH = 1.0  # of an episode that is used [s]
 _SETTLE = 0.5  # beginning of an episode that is not compared, since its past is unknown [s]
 _BLOCK, _BLOCKS = 2.0, 40  # longest block of time [s], and how many there are at least
@@ -48,15 +49,6 @@ _DIFFERENCES = (0.3, 0.3, 0.2, 0.2, 0.1, 0.1, 0.05)
 _LEAST = 0.06
 _OUTLIER = 3.0  # residuals beyond so many deviations count less (Huber)
 _LOOP = 0.012  # longest time that a recording loop needs from reading to commanding [s]
-
-
-_BOUNDS = np.array(
-    [
-        [one.metadata["at_least"], one.metadata["at_most"]]
-        for one in fields(ServoConfig)
-        if one.name in PARAMETERS
-    ]
-).T
 
 
 @dataclass(frozen=True)
@@ -98,14 +90,7 @@ def motions_of(dataset: Dataset, scene: Scene) -> list[ArmMotion]:
     for key, column in columns.items():
         if not np.isfinite(column).all():
             raise NotFiniteError(f"{dataset.root}: {key} has values that are not finite")
-    if (lerobot := scene.robot.lerobot) is None:
-        raise UsageError(f"{scene.robot.name} has no servos; expected so101 or an arm like it")
-    closed, opened = lerobot.gripper
-    angles: list[F64] = []
-    for key in ("action", "observation.state"):
-        joints = np.radians(columns[key].astype(np.float64))
-        joints[:, -1] = closed + columns[key][:, -1] / 100 * (opened - closed)
-        angles.append(joints)
+    angles = [to_angles(scene.robot, columns[key]) for key in ("action", "observation.state")]
     motions: list[ArmMotion] = []
     for start, stop in zip(dataset.episodes.start, dataset.episodes.stop, strict=True):
         positions = np.asarray(np.unwrap(angles[1][start:stop], axis=0), float)
@@ -118,42 +103,82 @@ def motions_of(dataset: Dataset, scene: Scene) -> list[ArmMotion]:
     return motions
 
 
+def _gripper_of(robot: Robot) -> tuple[float, float]:
+    if robot.lerobot is None:
+        raise UsageError(f"{robot.name} has no servos; expected so101 or an arm like it")
+    return robot.lerobot.gripper
+
+
+def to_angles(robot: Robot, units: NDArray[Any]) -> F64:
+    """Return joint angles [rad] of what LeRobot records, degrees and 0 to 100, (T, n)."""
+    closed, opened = _gripper_of(robot)
+    angles = np.radians(units.astype(np.float64))
+    angles[:, -1] = closed + units[:, -1] / 100 * (opened - closed)
+    return angles
+
+
+def in_units(robot: Robot, angles: F64) -> F64:
+    """Return joint angles [rad] as LeRobot records them, degrees and 0 to 100, (T, n)."""
+    closed, opened = _gripper_of(robot)
+    units = np.degrees(angles)
+    units[:, -1] = 100 * (angles[:, -1] - closed) / (opened - closed)
+    return units
+
+
 def parameters(deviations: F64) -> F64:
     """Return the parameters (..., 8) that are some prior deviations from the default, (..., 8)."""
-    default = np.array([asdict(ServoConfig())[name] for name in PARAMETERS])
+    default = default_servo()
     values = default * np.exp(FACTOR * deviations)
     for place, name in enumerate(PARAMETERS):
         if name in ADDED:
             values[..., place] = default[place] + ADDED[name] * deviations[..., place]
-    return np.clip(values, *_BOUNDS)
+    return np.clip(values, *BOUNDS)
 
 
 def _lowest() -> F64:
     """Return the deviations at which added parameters are zero, (8,)."""
-    default = asdict(ServoConfig())
     return np.array(
-        [-default[name] / ADDED[name] if name in ADDED else -np.inf for name in PARAMETERS]
+        [
+            -value / ADDED[name] if name in ADDED else -np.inf
+            for name, value in zip(PARAMETERS, default_servo(), strict=True)
+        ]
     )
 
 
-class ServoArm:
+class Arm(Protocol):
+    """A function from servos to positions, with `fps` frames per second."""
+
+    fps: float
+
+    def positions(self, servos: F64, motion: ArmMotion) -> F64:
+        """Return positions (L, T, n) [rad] for servos (L, n, 8), as `ServoArm` does."""
+        ...
+
+
+class ServoArm(Arm):
     """An arm with servos, as a function from their parameters to its positions.
 
     Args:
-        scene: A scene of the arm in which it touches nothing.
+        model: The arm, compiled, where it touches nothing.
+        q: Addresses of its joints in `qpos`, (n,).
+        ctrl: Their motors, (n,).
         fps: Frames per second of the motions.
     """
 
-    def __init__(self, scene: Scene, fps: float):
-        self.fps, self._scene = fps, scene
+    def __init__(self, model: mujoco.MjModel, q: I64, ctrl: I64, fps: float):
+        self.fps, self._plain = fps, model
         self._steps = math.ceil(MOST_HZ / fps)  # physics steps in a frame
         self._dt = 1 / (fps * self._steps)
-        self._q = np.array([*scene.arm_q, *scene.gripper.q])
-        self._ctrl = np.array([*scene.arm_ctrl, *scene.gripper.ctrl])
-        joints = [int(np.flatnonzero(scene.model.jnt_qposadr == q)[0]) for q in self._q]
-        self._dof = scene.model.jnt_dofadr[joints]
+        self._q, self._ctrl = q, ctrl
+        self._dof = dofs_of(model, q)
         self._models: list[mujoco.MjModel] = []  # kept, because copies of meshes take long
-        self._threads = [mujoco.MjData(scene.model) for _ in range(2)]
+        self._threads = [mujoco.MjData(model) for _ in range(2)]
+
+    @classmethod
+    def of_scene(cls, scene: Scene, fps: float) -> ServoArm:
+        """Return the arm of a scene."""
+        q, ctrl = np.append(scene.arm_q, scene.gripper.q), scene.arm_ctrl
+        return cls(scene.model, q, np.append(ctrl, scene.gripper.ctrl), fps)
 
     def positions(self, servos: F64, motion: ArmMotion) -> F64:
         """Simulate a motion with several sets of servos.
@@ -165,7 +190,7 @@ class ServoArm:
         Returns:
             Positions at every frame [rad], (L, T, n).
         """
-        model, start = self._scene.model, mujoco.MjData(self._scene.model)
+        model, start = self._plain, mujoco.MjData(self._plain)
         start.qpos[self._q] = motion.positions[0]
         whole = mujoco.mjtState.mjSTATE_FULLPHYSICS
         state = np.empty(mujoco.mj_stateSize(model, whole))
@@ -187,10 +212,10 @@ class ServoArm:
         """Return one of the arm's models, with servos (n, 8)."""
         values = dict(zip(PARAMETERS, servos.T, strict=True))
         if number == len(self._models):
-            self._models.append(copy.copy(self._scene.model))
+            self._models.append(copy.copy(self._plain))
         model = self._models[number]
         model.opt.timestep = self._dt
-        set_joints(model, self._dof, values["friction"], values["armature"])
+        set_joints(model, self._dof, servos)
         gain = values["stiffness"] * GAIN / FACTORY_GAIN
         set_motors(model, self._ctrl, gain, values["damping"], values["torque"])
         return model
@@ -212,8 +237,7 @@ class ServoArm:
             here = goals[before // self._steps, joints]
             there = goals[np.minimum((before + 1) // self._steps, frames - 1), joints]
             goal = here + share * (there - here)
-            ramp = np.clip(goal, ramp - most, ramp + most)
-            at = np.clip(at, ramp - play, ramp + play)
+            ramp, at = follow(ramp, at, goal, most, play)
             commands[:, step] = at
         return commands
 
@@ -247,7 +271,7 @@ class Identified:
 
 
 def identify(
-    arm: ServoArm,
+    arm: Arm,
     motions: Sequence[ArmMotion],
     joints: Sequence[str],
     on_round: Callable[[], None] = lambda: None,
@@ -328,7 +352,7 @@ class _Trial:
         )
 
 
-def _trial(arm: ServoArm, motions: Sequence[ArmMotion], z: F64, difference: float) -> _Trial:
+def _trial(arm: Arm, motions: Sequence[ArmMotion], z: F64, difference: float) -> _Trial:
     """Simulate the motions with servos and with each of their parameters changed both ways."""
     skip, count = round(_SETTLE * arm.fps), len(PARAMETERS)
     changes = difference * np.eye(count)[:, None]
@@ -347,7 +371,7 @@ def _trial(arm: ServoArm, motions: Sequence[ArmMotion], z: F64, difference: floa
 
 def _spread(errors: F64) -> F64:
     """Return robust standard deviations of errors (N, n) [rad], (n,); at least an encoder's."""
-    return np.maximum(1.4826 * np.median(np.abs(errors), axis=0), STEP)
+    return np.maximum(1.4826 * np.median(np.abs(errors), axis=0), _ENCODER)
 
 
 def _summary(

@@ -82,6 +82,7 @@ COMMANDS = {
     "robot check": ("robots:RobotCheckOptions", "measure what an arm can do, before recording"),
     "robot certify": ("robots:CertifyOptions", "measure from which states the expert recovers"),
     "robot identify": ("robots:IdentifyOptions", "find a real arm's servos from a dataset"),
+    "robot excite": ("robots:ExciteOptions", "write a motion that tells a real arm's servos"),
     "env check": (
         "robots:EnvCheckOptions:env",
         "does a world of your own keep the contract, and how good is its expert",

@@ -2,8 +2,8 @@
 
 `manip-il serve`: a virtual SO-101 behind serial ports, for LeRobot's own programs.
 
-`manip-il robot new`, `check`, `certify`, `identify`: a YAML file for your own arm, what the arm and
-its expert can do, and the servos of a real one.
+`manip-il robot new`, `check`, `certify`, `identify`, `excite`: a YAML file for your own arm, what
+the arm and its expert can do, the servos of a real one, and a motion that tells them.
 """
 
 from dataclasses import MISSING, dataclass, field
@@ -20,7 +20,8 @@ from manip_il.cli.common_options import (
 from manip_il.cli.outputs import Output, Replacing, output_folder
 from manip_il.cli.parsing import Given, given
 from manip_il.option import NameOrPath, Seeded, option
-from manip_il.serve.config import ServoConfig, SessionConfig
+from manip_il.robots.servos import ServoConfig
+from manip_il.serve.config import SessionConfig
 from manip_il.tasks import NAMES
 from manip_il.worlds.config import EnvConfig
 
@@ -131,9 +132,10 @@ class CertifyOptions(Seeded, EngineOptions, Output):
 class IdentifyOptions(Output):
     """Find the servos of an arm from a LeRobot dataset of it.
 
-    Needs `action` and `observation.state` alone. Writes servos.yaml, which `serve --servo=` reads,
-    with a value and a 95 % interval of every parameter of every joint, and report.html. With
-    `serve --vary=servo` each world then has servos drawn from these intervals.
+    Needs `action` and `observation.state` alone. Writes arm.yaml, the robot with these servos, for
+    `--robot.type=` of record, dagger, eval and serve: a value and a 95 % interval of each parameter
+    of each joint; and report.html. With `--vary=servo` each world has servos drawn from the
+    intervals.
 
     Example: manip-il robot identify datasets/session --output_dir=runs/my_servos
     """
@@ -141,6 +143,22 @@ class IdentifyOptions(Output):
     dataset: Path = option(MISSING, "a dataset of an arm with servos", positional=True)
     robot: NameOrPath = option("so101", "the arm", flag="robot.type")
     output_dir: Path = output_folder("runs/servos")
+
+
+@dataclass(frozen=True)
+class ExciteOptions(Replacing, Seeded):
+    """Write a motion that tells an arm's servos, for `robot identify`, as a LeRobot dataset.
+
+    Every joint jumps, swings and slowly turns back, clear of the table and of the arm itself; the
+    gripper must be empty. `lerobot-replay` plays it; `lerobot-record --teleop.type=recorded` also
+    records what the arm does (docs/virtual-robot.md).
+
+    Example: manip-il robot excite datasets/motion
+    """
+
+    dataset: Path = option(MISSING, "folder of the new dataset", positional=True)
+    robot: NameOrPath = option("so101", "the arm", flag="robot.type")
+    seconds: float = option(120.0, "length of the motion [s]", at_least=6, at_most=3600)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ SUITES = {
     "randomised": ("object", "view", "clutter", "dynamics"),
     "all": ("nominal", "knocked", "sensing", "late", "object", "view", "clutter", "dynamics"),
 }
-CONDITIONS = (*SUITES["all"], "random_actions")
+CONDITIONS = (*SUITES["all"], "random_actions", "servo")
 _YAML = (".yaml", ".yml")
 _OWN = Path(__file__).with_name("conditions")  # the YAML files of `CONDITIONS`
 

@@ -163,9 +163,12 @@ def reach_of(robot: Robot) -> Reach:
 
 
 def _place(robot: Robot) -> Path:
-    """Path of a map: beside the YAML of a robot that ships, else in the cache."""
-    if robot.name in ROBOTS and robot == get_robot(robot.name):
-        return HERE / f"{robot.name}.reach.npz"
+    """Path of a map: beside the YAML of a robot that ships, whatever its servos, else in the
+    cache.
+    """
+    for name in ROBOTS:
+        if replace(robot, name=name, servos={}) == get_robot(name):
+            return HERE / f"{name}.reach.npz"
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return cache / "manip_il" / f"{robot.name}.reach.{_key(robot)}.npz"
 

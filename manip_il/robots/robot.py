@@ -18,6 +18,7 @@ import numpy as np
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import F64
+from manip_il.robots.servos import Servos, servo_ranges
 
 _INCLUDE = re.compile(rb"<(?:include|model)\s[^>]*?\bfile\s*=\s*[\"']([^\"']+)")
 FRAGMENT = ": it is a fragment; expected the model that includes it"
@@ -409,6 +410,8 @@ class Robot:
             patterns win.
         lerobot: How LeRobot's recorder writes the robot; its servos' units then replace [rad]
             and [m].
+        servos: How the servos move, by joint and parameter: value, and the ends of its range. None:
+            they are ideal, and gravity does not act on the arm.
     """
 
     name: str
@@ -430,6 +433,8 @@ class Robot:
     max_joint_step: float = JOINT_STEP
     colours: Mapping[str, tuple[float, float, float]] = field(default_factory=dict, hash=False)
     lerobot: LeRobotConfig | None = None
+    # not in the robot's text, which older fingerprints hash
+    servos: Servos = field(default_factory=dict, hash=False, repr=False)
 
     def __post_init__(self) -> None:
         count = len(self.joints)
@@ -439,6 +444,10 @@ class Robot:
                 f"lerobot.names has {named} names; expected {count + 1}: the arm's, then the"
                 " gripper's"
             )
+        if self.servos:
+            servo_ranges(self.servos, self.joint_names)
+            if self.gripper.files or len(self.gripper.joints) != 1:
+                raise ManipError("servos need a gripper with one driven joint")
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -19,11 +19,13 @@ from manip_il.robots.robot import (
     GripperConfig,
     ModelFiles,
     Robot,
+    place,
     read,
 )
 from manip_il.robots.spec import arm_joints
 
 SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
+EXTENDS = "extends"  # key of the robot whose values a YAML changes
 
 
 def get_robot(name: NameOrPath) -> Robot:
@@ -56,6 +58,9 @@ def read_robot(path: Path) -> Robot:
         if path.stem in ROBOTS and path.resolve() != ROBOTS[path.stem].resolve():
             raise ManipError(f"a built-in robot is called {path.stem}; rename the file")
         said = _said(path, read_yaml(path, "a robot's YAML"))
+        if EXTENDS in said:
+            base = _base(said.pop(EXTENDS), path)
+            return replace(base, **said | {"cameras": {**base.cameras, **said.get("cameras", {})}})
         if all(name in said for name in FOUND):
             return Robot(**said)
         # imported here: mink is slow, and a shipped YAML is complete
@@ -71,23 +76,35 @@ def read_robot(path: Path) -> Robot:
         raise UsageError(str(error) if named else f"{path}: {error}") from None
 
 
+def _base(name: Any, path: Path) -> Robot:
+    """Return the robot that a YAML extends."""
+    if checks.text(EXTENDS, name) in ROBOTS:
+        return get_robot(name)
+    base = place(EXTENDS, name, path.parent)
+    if base.resolve() == path.resolve():
+        raise ManipError(f"{path} extends itself")
+    return get_robot(base)
+
+
 def _said(path: Path, tree: Any) -> dict[str, Any]:
-    """The fields that a YAML gives, and the arm's joints."""
+    """The fields that a YAML gives, and the arm's joints or the robot that is extended."""
     tree, kinds = dict(checks.mapping(str(path), tree)), typing.get_type_hints(Robot)
-    known = (*KEYS, *(name for name in kinds if name not in ("name", "files")))
+    own = [name for name in kinds if name not in ("name", "files", "gripper")]
+    known = (EXTENDS, *own) if EXTENDS in tree else (*KEYS, "gripper", *own)
     for key in tree:
         if key not in known:
             raise UnknownName(f"key in {path}:", key, known)
     if "hand" not in tree and "ee" in tree:
         tree["hand"] = checks.mapping("ee", tree["ee"]).get("body")
-    for name in ("model", "hand", "gripper", "workspace"):
-        if name not in tree:
-            raise ManipError(f"{path} has no {name!r}; a robot's YAML needs one")
-    said: dict[str, Any] = {
-        "name": checks.name("a robot's name", path.stem),
-        "files": ModelFiles.read("", tree, path.parent),
-        "gripper": _gripper(checks.mapping("gripper", tree["gripper"]), path.parent),
-    }
+    said: dict[str, Any] = {"name": checks.name("a robot's name", path.stem)}
+    if EXTENDS in tree:
+        said[EXTENDS] = tree.pop(EXTENDS)
+    else:
+        for name in ("model", "hand", "gripper", "workspace"):
+            if name not in tree:
+                raise ManipError(f"{path} has no {name!r}; a robot's YAML needs one")
+        said["files"] = ModelFiles.read("", tree, path.parent)
+        said["gripper"] = _gripper(checks.mapping("gripper", tree["gripper"]), path.parent)
     for camera in checks.mapping("cameras", tree.get("cameras", {})):
         if camera not in SCENE_CAMERAS:
             raise UnknownName("camera in a robot's YAML:", camera, SCENE_CAMERAS)
@@ -96,7 +113,7 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
         for key, value in tree.items()
         if key not in (*KEYS, "gripper")
     }
-    if "joints" not in said:
+    if EXTENDS not in said and "joints" not in said:
         said["joints"] = arm_joints(said["name"], said["files"], said["hand"], said["gripper"])
     return said
 

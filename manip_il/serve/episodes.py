@@ -5,7 +5,6 @@ A frame is logged when the client reads the follower's position, so that the fra
 its own dataset.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 from manip_il.collect.edits import SERVED
@@ -52,7 +51,7 @@ class ServedEpisodes:
         self._station = station
         self._env = LadderEnv(config)
         self._leader = leader
-        self._expert = LadderExpert(self._env.scene)
+        self._expert = LadderExpert(station.env.scene)
         self.driver = Actor.EXPERT
         self._reads: list[tuple[Read, Actor]] | None = None
         self._journal: Journal | None = None
@@ -112,21 +111,15 @@ class ServedEpisodes:
         """Return the frame of one read, with the command and the outcome at the next read."""
         (now, actor), (after, _) = reads[step : step + 2]
         env = self._env
-        env.set_state(after.state)
+        env.set_state(self._station.as_named(after.state))
         reward, success = env.reward, env.solved
-        env.set_state(now.state)
-        label = self._expert.label(now.state)
-        if label.valid:  # as the leader would show it: beyond the label by the follower's sag
-            label = replace(
-                label,
-                action=self._station.to_action(self._station.to_joints(label.action) + now.sag),
-            )
+        env.set_state(state := self._station.as_named(now.state))
         return Transition(
             seed=self._station.seed,
             step=step,
-            state=now.state,
+            state=state,
             observation=env.observe(),
-            label=label,
+            label=self._expert.label(now.state),
             executed_action=self._station.to_action(after.told),
             actor=actor,
             reward=reward,

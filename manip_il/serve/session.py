@@ -23,7 +23,7 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.view import Window
 from manip_il.worlds.config import EnvConfig
-from manip_il.worlds.ladder.world import WORLD, LadderEnv
+from manip_il.worlds.ladder.world import WORLD
 from manip_il.worlds.table import env_spec, world_of
 
 Say = Callable[[str], None]
@@ -60,7 +60,7 @@ def serve(
         stack.callback(weigh_session, weigh_session() or "0")
         if world_of(env.robot) is not WORLD:
             raise UsageError(f"{env_spec(env).robot} has no Feetech servos; choose another robot")
-        station = Station(LadderEnv(env, None, conditions), config)
+        station = Station(env, config, conditions)
         stack.callback(station.close)
         if cameras is not None:
             stack.callback(Cameras(station, cameras, config.camera_port).close)
@@ -125,9 +125,7 @@ def slider_mover(station: Station) -> Mover:
 
     def move() -> F64:
         nonlocal seed
-        joints = (
-            window.commands[order] if seed == station.seed else env.data.qpos[station.follower.q]
-        )
+        joints = window.commands[order] if seed == station.seed else station.follower.q
         seed, shown = station.seed, copy.copy(env.data)
         shown.ctrl[order] = joints
         window.show(shown, env.world.variation)

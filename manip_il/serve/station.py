@@ -2,9 +2,8 @@
 client reads them.
 """
 
-import copy
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -16,14 +15,16 @@ from manip_il import checks
 from manip_il.data.atomic import write_file
 from manip_il.errors import UsageError
 from manip_il.mdp import F64, State
+from manip_il.robots.table import get_robot
+from manip_il.seeding import rng_for
 from manip_il.serve.bus import STEPS, Bus, Calibration, encoder_steps
 from manip_il.serve.config import SessionConfig
-from manip_il.serve.servo import Follower, draw_servos
-from manip_il.sim.env import ManipEnv
-from manip_il.sim.scene import Scene
+from manip_il.serve.servo import Follower, draw_offset, with_servos
+from manip_il.sim.conditions import Condition
 from manip_il.sim.view import Clock
-from manip_il.sim.world import World
+from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.ladder.expert import LadderExpert
+from manip_il.worlds.ladder.world import LadderEnv
 
 FEETECH = "so_follower"  # LeRobot's `robot_type` of arms with these servos
 TICK = 4  # physics steps between moments at which clients read and write: 8 ms at 480 Hz
@@ -40,13 +41,11 @@ class Read(NamedTuple):
     Attributes:
         state: State of the world.
         told: The follower's target after `commands` commands, joint angles [rad], (n,).
-        sag: How far the follower hangs below its target, joint angles [rad], (n,).
         commands: Number of commands that the follower has received.
     """
 
     state: State
     told: F64
-    sag: F64
     commands: int
 
 
@@ -70,25 +69,31 @@ class Station:
         seen: What the cameras see: `qpos`, `mocap_pos` and `mocap_quat` of MuJoCo.
     """
 
-    def __init__(self, env: ManipEnv, config: SessionConfig):
+    def __init__(
+        self, named: EnvConfig, config: SessionConfig, conditions: Sequence[Condition] = ()
+    ):
         """Open the ports and draw the world of seed 0.
 
         Args:
-            env: The environment to simulate; its motors become servos.
+            named: The environment to simulate; its motors become servos.
             config: Options of the session.
+            conditions: How worlds vary.
 
         Raises:
             UsageError: If the robot has no Feetech servos.
         """
-        robot = env.scene.robot
+        robot = get_robot(named.robot)
         if robot.lerobot is None or robot.lerobot.robot_type != FEETECH:
             raise UsageError(
                 f"--robot.type={robot.name} has no Feetech servos; expected so101, or the YAML of"
                 f" an arm with lerobot.robot_type: {FEETECH}"
             )
-        # a copy, as its motors become servos
-        env.world = World(Scene(robot, env.scene.task, copy.copy(env.scene.model)))
+        env = LadderEnv(named, None, conditions, with_servos(robot, config))
+        servos = env.scene.servos
+        assert servos is not None
         self.env, self._config = env, config
+        # what states of the environment that was named do not have
+        self._beyond = 0 if robot.servos else env.scene.model.nuserdata
         self._expert = LadderExpert(env.scene)
         self._step = 1 / env.config.control_hz  # [s]
         moments = env.config.control_hz * env.config.physics_steps / TICK  # a second
@@ -97,7 +102,7 @@ class Station:
         # the servos' joint limits [rad], (n, 2)
         self.limits: F64 = np.array([*ranges, sorted(robot.lerobot.gripper)])
         self.buses = {name: self._open(name) for name in ("follower", "leader")}
-        self.follower = Follower(env.world, self.buses["follower"], env.config.physics_step)
+        self.follower = Follower(env.world, servos, self.buses["follower"])
         self.mover: Mover = lambda: None
         self.hand: F64 | None = None
         self.on_read: Callable[[Read], None] = lambda read: None
@@ -128,9 +133,11 @@ class Station:
     def look(self) -> Read:
         """Return the world and the follower as a client reads them now."""
         with self.buses["follower"].lock:
-            return Read(
-                self._shown, self.follower.goal(), self._sag, self.buses["follower"].commands
-            )
+            return Read(self._shown, self.follower.goal(), self.buses["follower"].commands)
+
+    def as_named(self, state: State) -> State:
+        """Return a state as the environment that was named has it, perhaps without servos."""
+        return replace(state, physics=state.physics[: len(state.physics) - self._beyond])
 
     @property
     def is_solved(self) -> bool:
@@ -142,22 +149,21 @@ class Station:
 
         None if the state has no valid label.
 
-        These are the label's joints plus the follower's sag and the offset of its servos.
+        These are the label's joints plus the offset of the follower's servos.
         """
         label = self._expert.label(self.env.get_state(), self.env)
-        return (
-            self.to_joints(label.action) + self.follower.sag() + self.follower.offset
-            if label.valid
-            else None
-        )
+        return self.to_joints(label.action) + self.follower.offset if label.valid else None
 
     def reset(self, seed: int) -> None:
         """Draw the world of a seed; follower and leader are at its start posture."""
         self.env.start(seed)
         self.seed, self._solved = seed, 0
+        world, servos = self.env.world, self.follower.servos
+        if self._config.varies:
+            servos.begin(world.model, world.data, servos.draw(rng_for(seed, "servos"), 1.0))
         names = self.env.scene.robot.joint_names
-        self.follower.reset(draw_servos(self._config, names, seed))
-        self._place_leader(self.env.data.qpos[self.follower.q])
+        self.follower.reset(draw_offset(self._config, names, rng_for(seed, "encoders")))
+        self._place_leader(self.follower.q)
         self._show()
 
     def run(self, each_step: Callable[[], bool]) -> None:
@@ -169,7 +175,7 @@ class Station:
         """Advance the simulation by one control step."""
         env = self.env
         if self.hand is not None:
-            env.data.qpos[self.follower.q] = self.hand
+            env.data.qpos[self.follower.servos.q] = self.hand
             env.data.qvel[:] = 0.0
             mujoco.mj_forward(env.world.model, env.data)
             self._place_leader(self.hand)
@@ -197,7 +203,8 @@ class Station:
 
         Those with torque on move to their goals instead.
         """
-        bus, most = self.buses["leader"], self.follower.servos["speed"] * self._step
+        bus = self.buses["leader"]
+        most = self.follower.servos.of(self.env.data, "speed") * self._step
         wanted = np.where(bus["Torque_Enable"] > 0, bus.goals(), self._leader if q is None else q)
         self._leader = self._leader + np.clip(wanted - self._leader, -most, most)
         bus.show(self._leader)
@@ -209,7 +216,7 @@ class Station:
         self.seen = data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()
         with self.buses["follower"].lock:
             self.follower.show()
-            self._shown, self._sag = state, self.follower.sag()
+            self._shown = state
 
     def to_joints(self, action: F64) -> F64:
         """Return the joints [rad], (n,), that an action (n,) commands."""

@@ -91,6 +91,7 @@ RANGES = {
     "friction": Quantity((0.01, 10), "model", of_object=True),
     "joint_damping": Quantity((0.01, 100), "model", places=[1], nominal=1.0),
     "actuator_gain": Quantity((0.1, 10), "model", places=[2], nominal=1.0),
+    "servo": Quantity((0, 1)),
     "posture": Quantity((0, 0.5), places=[3]),
     "colour": Quantity((0, 1), "look", True, _colour, range(4, 7), OWN),
     "table": Quantity((0, 1), "look", False, _colour, range(7, 10), OWN),
@@ -129,6 +130,7 @@ class Condition:
         friction: Sliding friction of the object.
         joint_damping: Factor on the damping of every arm joint.
         actuator_gain: Factor on kp of the arm's actuators; its square root is that on kv.
+        servo: Share of the ranges in the robot's YAML from which its servos are drawn.
         posture: Largest offset of every joint from home at the start [rad].
         colour: Red, green and blue of the object, each from the range.
         table: The same for the table.
@@ -159,7 +161,13 @@ class Condition:
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
     def for_world(
-        self, *, has_object: bool, sees: bool, sizes: Range | None, named: bool = False
+        self,
+        *,
+        has_object: bool,
+        sees: bool,
+        sizes: Range | None,
+        named: bool = False,
+        servos: bool = False,
     ) -> Condition | None:
         """Return the condition without the ranges that have no effect.
 
@@ -168,6 +176,7 @@ class Condition:
             sees: Whether the policy has cameras.
             sizes: Object sizes that the task can take [m]; None: only its own.
             named: Whether the task's texts tell objects by their colours, which then stay.
+            servos: Whether the robot has servos, which then replace actuators' gain and damping.
 
         Returns:
             The condition; None if it had ranges and none of them is left.
@@ -182,6 +191,7 @@ class Condition:
             and (sees or RANGES[name].changes not in ("look", "pictures"))
             and (sizes or name != "size")
             and not (named and name == "colour")
+            and name not in (("joint_damping", "actuator_gain") if servos else ("servo",))
         }
         if "size" in kept and sizes is not None:
             (least, most), asked = sizes, kept["size"]

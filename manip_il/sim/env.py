@@ -161,6 +161,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         posture = home + rng.uniform(-1, 1, len(home)) * _JOINT_JITTER
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = posture
         scene.gripper.put(data, rng.uniform(scene.gripper.least, scene.gripper.most))
+        if servos := scene.servos:
+            drawn = servos.draw(rng_for(seed, "servos"), self.drawn.get("servo", 0.0))
+            servos.begin(world.model, data, drawn)
         if largest := self.drawn.get("posture"):
             draw_posture(world, rng_for(seed, "posture"), largest)
         world.update()
@@ -227,9 +230,13 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         scene, data = self.scene, self.data
         executed = self._events.action(action, self._step)
         action = scene.actions.clip(executed, self._step)
-        data.ctrl[scene.arm_ctrl], opening = scene.actions.split(action)
-        data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
-        self.simulate()
+        joints, opening = scene.actions.split(action)
+        goal = np.append(joints, scene.gripper.command(opening))
+        if servos := scene.servos:
+            self.simulate(lambda: servos.command(self.world.model, data, goal))
+        else:
+            data.ctrl[scene.arm_ctrl], data.ctrl[scene.gripper.ctrl] = np.split(goal, [len(joints)])
+            self.simulate()
         return executed
 
     def simulate(self, before: Callable[[], None] | None = None) -> None:

@@ -120,6 +120,7 @@ def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None
 
     def contacts_at(q: F64) -> set[tuple[int, int, bool]]:
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = q
+        world.hold()
         world.update()
         mujoco.mj_collision(world.model, data)
         return arm_contacts(world)
@@ -147,6 +148,7 @@ def arm_contacts(world: World) -> set[tuple[int, int, bool]]:
 
 def _open_gripper(world: World, rng: np.random.Generator) -> None:
     world.gripper.put(world.data, world.gripper.most)
+    world.hold()
     _settle(world)
 
 

@@ -20,6 +20,7 @@ from manip_il.robots.spec import add_wrist_camera, arm_spec, copy_options
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.rests import LEAST_HEIGHT, LEAST_ROOM, Hull
+from manip_il.sim.servo import ArmServos, memory_size
 from manip_il.sim.shape import ANY
 from manip_il.sim.variation import Object
 
@@ -60,6 +61,7 @@ class Scene:
             task.
         arm_q: Indices of the arm's joints into `qpos`, (arm,).
         arm_ctrl: Indices of the arm's actuators into `ctrl`, (arm,).
+        servos: The robot's servos; None if they are ideal.
         ee_site: Id of the site `ee`.
         shoulder: Id of the arm's first joint.
         yaws: Least and greatest yaw of the hand, relative to `World.ahead` [rad].
@@ -96,6 +98,11 @@ class Scene:
         self.furniture: I64 = np.flatnonzero(model.body_mocapid[roots] >= 0)
         self.arm_q = np.array([joint.qposadr[0] for joint in joints], np.int64)
         self.arm_ctrl = np.array([motor.id for motor in motors], np.int64)
+        driven = [
+            np.append(self.arm_q, self.gripper.q),
+            np.append(self.arm_ctrl, self.gripper.ctrl),
+        ]
+        self.servos = ArmServos(robot, model, *driven) if robot.servos else None
         self.ee_site: int = model.site(PREFIX + "ee").id
         self.shoulder: int = joints[0].id
         self.yaws = _yaws(robot, model, joints, self.arm_q)
@@ -121,6 +128,7 @@ def build_scene(robot: Robot, task: Any, step: float = DT_SIM) -> Scene:
     try:
         spec = scene_spec(robot, task)
         spec.option.timestep = step
+        spec.nuserdata = memory_size(robot, step)
         model = spec.compile()
     except ValueError as error:
         raise UsageError(

@@ -20,6 +20,7 @@ from manip_il.robots.reach import Reach, reach_of
 from manip_il.sim import variation as variations
 from manip_il.sim.rests import Hull
 from manip_il.sim.scene import STATE_KIND, Scene
+from manip_il.sim.servo import set_joints
 
 # heights and distance at which a hand may hit a neighbour of an object [m]
 _BESIDE, _NEAR = (-0.02, 0.07), 0.08
@@ -56,7 +57,9 @@ class World:
         self.robot = scene.robot
         self.gripper = scene.gripper
         self.variation = scene.nominal
-        self._plain = scene.model, mujoco.MjData(scene.model)
+        # servos change their model in every step
+        model = copy.copy(scene.model) if scene.servos else scene.model
+        self._plain = model, mujoco.MjData(model)
         self._own: tuple[mujoco.MjModel, mujoco.MjData] | None = None
         self._cache: dict[Any, Any] = {}  # cleared when the world moves
         self._use(*self._plain)
@@ -95,6 +98,8 @@ class World:
         variations.apply(
             self.model, self.scene.model, self.scene.objects, self.scene.arm_ctrl, variation
         )
+        if self.scene.servos:  # what follows must not depend on the last episode's
+            set_joints(self.model, self.scene.servos.dof, self.scene.servos.ranges[0])
         mujoco.mj_setConst(self.model, self.data)  # updates what depends on masses
 
     def physics(self) -> F64:
@@ -118,6 +123,8 @@ class World:
             raise MismatchError("size of a state", "it", given, self.scene.name, sizes)
         self.vary(variation)
         mujoco.mj_setState(self.model, self.data, physics, STATE_KIND)
+        if self.scene.servos:
+            self.scene.servos.apply(self.model, self.data)
         self.update()
 
     def update(self) -> None:
@@ -146,6 +153,11 @@ class World:
         if mocap < 0:
             raise ManipError(f"{name!r} is neither an object nor a mocap body; it cannot be placed")
         self.data.mocap_pos[mocap], self.data.mocap_quat[mocap] = position, quaternion
+
+    def hold(self) -> None:
+        """Make the current joint positions the goals of the servos, if there are any."""
+        if self.scene.servos:
+            self.scene.servos.hold(self.data)
 
     # Readings
 
@@ -185,6 +197,13 @@ class World:
     def measured(self) -> F64:
         """Joint positions and gripper opening in the units of the robot's actions, (n,)."""
         return self.scene.actions.join(self.data.qpos[self.scene.arm_q], self.opening)
+
+    def lead(self, way: F64) -> F64 | float:
+        """Return how far servos must aim beyond a way (arm,) to go it [rad], (arm,); 0 if ideal."""
+        servos, count = self.scene.servos, len(way)
+        if servos is None:
+            return 0.0
+        return servos.lead(self.model, self.data, np.append(way, 0.0))[:count]
 
     @property
     def opening(self) -> float:

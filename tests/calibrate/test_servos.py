@@ -1,4 +1,4 @@
-"""Servos are found from goals and positions alone, and `serve` takes what was found."""
+"""Servos are found from goals and positions alone, and simulated arms take what was found."""
 
 from pathlib import Path
 
@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from manip_il.calibrate.servos import ArmMotion, ServoArm, parameters
+from manip_il.calibrate.servos import ArmMotion, ServoArm, in_units, parameters, to_angles
 from manip_il.cli.main import main
+from manip_il.data.dataset import Dataset
+from manip_il.lerobot_plugin.teleoperator import Recorded, RecordedConfig
 from manip_il.mdp import F64
-from manip_il.serve.config import SessionConfig
-from manip_il.serve.servo import PARAMETERS, draw_servos, read_servos
+from manip_il.robots.servos import PARAMETERS, default_servo, servo_ranges
+from manip_il.robots.table import get_robot
+from manip_il.sim.world import World
 from manip_il.worlds.ladder.world import scene_of
 
 FPS, SECONDS = 30, 4
@@ -37,16 +40,9 @@ def moved() -> ArmMotion:
     goals = RESTED + np.where(seconds < SECONDS / 2, jumps, swings)
     start = np.tile(RESTED, (len(goals), 1))
     return ArmMotion(
-        goals, ServoArm(SCENE, FPS).positions(hidden_servos()[None], ArmMotion(goals, start))[0]
+        goals,
+        ServoArm.of_scene(SCENE, FPS).positions(hidden_servos()[None], ArmMotion(goals, start))[0],
     )
-
-
-def in_units(angles: F64) -> F64:
-    """Return joint angles (T, n) [rad] as LeRobot records them."""
-    assert SCENE.robot.lerobot is not None
-    closed, opened = SCENE.robot.lerobot.gripper
-    share = 100 * (angles[:, -1:] - closed) / (opened - closed)
-    return np.concatenate([np.degrees(angles[:, :-1]), share], axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +53,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "local/arm", FPS, {"action": column, "observation.state": column}, root, "so_follower"
     )
     motion = moved()
-    frames = in_units(motion.goals), in_units(motion.positions)
+    frames = (in_units(SCENE.robot, one) for one in (motion.goals, motion.positions))
     for goal, position in zip(*(one.astype(np.float32) for one in frames), strict=True):
         made.add_frame({"action": goal, "observation.state": position, "task": "move"})
     made.save_episode()
@@ -65,39 +61,19 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_hidden_servos_are_found_and_served(dataset: Path, tmp_path: Path):
+def test_hidden_servos_are_found(dataset: Path, tmp_path: Path):
     assert main(["robot", "identify", str(dataset), f"--output_dir={tmp_path / 'found'}"]) == 0
     assert (tmp_path / "found/report.html").is_file()
-    values, low, high = read_servos(tmp_path / "found/servos.yaml", JOINTS)
+    robot = get_robot(tmp_path / "found/arm.yaml")
+    assert robot.name == "arm"
+    assert robot.workspace == SCENE.robot.workspace
+    values, low, high = servo_ranges(robot.servos, JOINTS)
     hidden = hidden_servos()
     assert ((low <= hidden) & (hidden <= high)).mean() > 0.95
     told = [PARAMETERS.index(name) for name in ("stiffness", "speed", "delay")]
     lift = [*JOINTS].index("shoulder_lift.pos")
     assert values[lift, told] == pytest.approx(hidden[lift, told], rel=0.1)
-    same, drawn = (
-        draw_servos(SessionConfig(servo=tmp_path / "found/servos.yaml", varies=varies), JOINTS, 1)
-        for varies in (False, True)
-    )
-    assert np.array_equal(same["delay"], values[:, PARAMETERS.index("delay")])
-    assert (low[:, 0] <= drawn["stiffness"]).all()
-    assert not np.array_equal(drawn["stiffness"], same["stiffness"])
-
-
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        ("shoulder_pan: 3", "shoulder_pan is 3"),
-        ("shoulder_pan: {stiffness: 3}", "stiffness of shoulder_pan is 3"),
-    ],
-)
-def test_a_wrong_file_of_servos_is_one_line(
-    content: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    (tmp_path / "servos.yaml").write_text(content)
-    words = ["serve", f"--servo={tmp_path / 'servos.yaml'}", f"--output_dir={tmp_path / 'out'}"]
-    assert main(words) in (1, 2)
-    [line] = capsys.readouterr().err.strip().splitlines()
-    assert said in line
+    scene_of(tmp_path / "found/arm.yaml", "reach")
 
 
 def test_a_dataset_of_another_arm_is_one_line(
@@ -107,3 +83,23 @@ def test_a_dataset_of_another_arm_is_one_line(
     assert main([*words, f"--output_dir={tmp_path / 'found'}"]) in (1, 2)
     [line] = capsys.readouterr().err.strip().splitlines()
     assert "action" in line
+
+
+def test_a_motion_is_clear_within_the_limits_and_played_by_lerobot(tmp_path: Path):
+    """Simulated with the default servos, the hand stays above the table."""
+    assert main(["robot", "excite", str(tmp_path / "motion"), "--seconds=30"]) == 0
+    dataset = Dataset.open(tmp_path / "motion")
+    goals = to_angles(SCENE.robot, dataset.columns(["action"])["action"])
+    assert len(goals) == 30 * FPS + 1
+    assert (np.ptp(goals, axis=0) > 0.5).all()
+    servos = np.tile(default_servo(), (1, len(JOINTS), 1))
+    places = ServoArm.of_scene(SCENE, FPS).positions(servos, ArmMotion(goals, goals))[0]
+    world, q = World(SCENE), np.append(SCENE.arm_q, SCENE.gripper.q)
+    for place in places:
+        world.data.qpos[q] = place
+        world.update()
+        assert world.ee.position[2] > 0.04
+    teleoperator = Recorded(RecordedConfig(root=tmp_path / "motion", calibration_dir=tmp_path))
+    played = [teleoperator.get_action() for _ in range(len(goals) + 1)]
+    assert [*played[0]] == [*JOINTS] == [*teleoperator.action_features]
+    assert played[-1] == played[-2] != played[0]

@@ -1,15 +1,20 @@
-"""Run `manip-il robot new`, `check`, `certify`, `identify`."""
+"""Run `manip-il robot new`, `check`, `certify`, `identify`, `excite`."""
 
 import os
 from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
 
 from manip_il import checks
+from manip_il.calibrate.excite import excite
 from manip_il.calibrate.page import advice as untold
 from manip_il.calibrate.page import identified_report, servo_table, to_yaml
-from manip_il.calibrate.servos import ROUNDS, ServoArm, identify, motions_of
+from manip_il.calibrate.servos import ROUNDS, ServoArm, identify, in_units, motions_of
 from manip_il.cli.outputs import OutputFile, about, progress, publish, say
 from manip_il.cli.robots import (
     CertifyOptions,
+    ExciteOptions,
     IdentifyOptions,
     RobotCheckOptions,
     RobotNewOptions,
@@ -17,7 +22,8 @@ from manip_il.cli.robots import (
 from manip_il.collect.inputs import env_config
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_file
-from manip_il.data.dataset import Dataset
+from manip_il.data.dataset import Dataset, EpisodeData
+from manip_il.data.lerobot_write import write_episodes
 from manip_il.errors import ManipError
 from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
 from manip_il.evaluation.robot_check import FILE_NAME as CHECK_FILE
@@ -31,6 +37,7 @@ from manip_il.progress import Progress
 from manip_il.robots.found import suggest, yaml_of
 from manip_il.robots.gripper import sweep
 from manip_il.robots.table import get_robot
+from manip_il.seeding import rng_for
 from manip_il.tasks import NAMES
 from manip_il.tasks.table import get_task
 from manip_il.worlds.ladder.world import scene_of
@@ -110,12 +117,34 @@ def run_identify(options: IdentifyOptions) -> None:
     scene = scene_of(options.robot, "reach")
     motions = motions_of(dataset, scene)
     with options.open() as folder:
-        arm = ServoArm(scene, dataset.fps)
+        arm = ServoArm.of_scene(scene, dataset.fps)
         with progress(ROUNDS, f"identify {options.dataset}") as bar:
             joints = scene.actions.names
             found = identify(arm, motions, joints, lambda: bar.step())
-        path = folder / "servos.yaml"
-        write_file(path, to_yaml(found).encode())
+        path, base = folder / "arm.yaml", options.robot
+        named = os.path.relpath(base, folder) if isinstance(base, Path) else base
+        write_file(path, to_yaml(found, named).encode())
         page = replace(identified_report(found, dataset.fps), **about(options))
         servo_table(found).print()
-        say(*untold(found), f"servos: {path}", f"report: {page.write(folder)}")
+        say(*untold(found), f"robot: {path}", f"report: {page.write(folder)}")
+
+
+def run_excite(options: ExciteOptions) -> None:
+    """Draw the motion, write it as a dataset."""
+    scene = scene_of(options.robot, "reach")
+    robot, names = scene.robot, list(scene.actions.names)
+    goals = excite(scene, robot.fps, options.seconds, rng_for(options.seed, "motion"))
+    actions = in_units(robot, goals).astype(np.float32)
+    episode = EpisodeData({"action": actions}, ["move every joint"] * len(actions))
+    column = {"dtype": "float32", "shape": [len(names)], "names": names}
+    write_episodes(
+        [episode],
+        options.dataset,
+        {"action": column},
+        robot.fps,
+        robot.lerobot.robot_type if robot.lerobot else "",
+        replace=options.overwrite,
+    )
+    say(f"{len(actions)} frames in {options.dataset}; put the arm near its first posture:")
+    said = zip(names, actions[0].tolist(), strict=True)
+    say(", ".join(f"{name} {value:.0f}" for name, value in said))

@@ -55,7 +55,7 @@ class LadderExpert(Expert):
             world.restore(state.physics, state.variation)
         q = world.data.qpos[self._scene.arm_q]
         if reason := self._unsound(world):
-            return self._hold(q, world.opening, reason)
+            return self._hold(q, world, reason)
         for phase, rung in self._rungs:
             if rung.holds(world):
                 target = rung.target(world)
@@ -65,7 +65,7 @@ class LadderExpert(Expert):
                         f"{self._scene.name}: rung {rung.name!r} returned a {kind}; expected a"
                         " Target"
                     )
-                return self._towards(q, world.opening, target, phase)
+                return self._towards(q, world, target, phase)
         raise ManipError(
             f"{self._scene.name}: no rung holds; expected the last rung to hold in every state"
         )
@@ -82,18 +82,18 @@ class LadderExpert(Expert):
                 return f"{name} out of reach"
         return self._task.unsound(world)
 
-    def _towards(self, q: F64, opening: float, target: Target, phase: int) -> Label:
+    def _towards(self, q: F64, world: World, target: Target, phase: int) -> Label:
         ee, ee_rotation = self._ik.ee_pose(q)
         position = ee + _clip_norm(target.position - ee, target.max_step)
         rotation = turned_towards(ee_rotation, target.rotation, target.max_turn)
         step = self._step(q, position, rotation, target)
         if step is None:
-            return self._hold(q, opening, "inverse kinematics has no solution")
+            return self._hold(q, world, "inverse kinematics has no solution")
         dq, residual = step
         if residual > NO_PROGRESS and math.dist(position.tolist(), ee.tolist()) > NEAR:
-            return self._hold(q, opening, "no joint step brings the hand nearer")
+            return self._hold(q, world, "no joint step brings the hand nearer")
         low, high = self._scene.actions.low, self._scene.actions.high
-        action = self._scene.actions.join(q + dq, target.opening)
+        action = self._scene.actions.join(q + dq + world.lead(dq), target.opening)
         return Label(np.minimum(np.maximum(action, low), high), phase, True, residual)
 
     def _step(
@@ -113,9 +113,9 @@ class LadderExpert(Expert):
         second = ik.step(2 * position - reached, rotation @ turned.T @ rotation, most, target.lean)
         return first if second is None else (second[0], first[1])
 
-    def _hold(self, q: F64, opening: float, reason: str) -> Label:
+    def _hold(self, q: F64, world: World, reason: str) -> Label:
         actions = self._scene.actions
-        action = actions.join(q, opening)
+        action = actions.join(q + world.lead(0 * q), world.opening)
         return Label(
             np.minimum(np.maximum(action, actions.low), actions.high), 0, False, 1.0, reason
         )

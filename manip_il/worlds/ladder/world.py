@@ -213,6 +213,7 @@ class LadderEnv(ManipEnv, Environment):
         config: Settings of the environment, complete.
         cameras: Cameras rendered in every step; None for none.
         conditions: How episodes differ from the nominal world, in turn by seed.
+        robot: The robot; by default the one that `config` names.
     """
 
     def __init__(
@@ -220,8 +221,10 @@ class LadderEnv(ManipEnv, Environment):
         config: EnvConfig,
         cameras: CameraConfig | None = None,
         conditions: Sequence[Condition] = (),
+        robot: Robot | None = None,
     ):
-        super().__init__(*parts_of(config), config, cameras=cameras, conditions=conditions)
+        named, task = parts_of(config)
+        super().__init__(robot or named, task, config, cameras=cameras, conditions=conditions)
         self.actions = self.scene.actions
         self._object = stored(config.object)
 
@@ -376,6 +379,8 @@ class LadderKind(WorldKind):
                 robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None)
             )
             own["robot_sha256"] = hashlib.sha256(repr(said).encode()).hexdigest()
+        if robot.servos:
+            own["servos_sha256"] = hashlib.sha256(repr(robot.servos).encode()).hexdigest()
         if config.object and (mesh := ObjectShape.parse(config.object).mesh):
             own["object_sha256"] = mesh.sha256
         return environment_fingerprint(model_bytes(config_scene(config).model), settings) | own
@@ -411,6 +416,7 @@ class LadderKind(WorldKind):
             sees=sees,
             sizes=task.sizes,
             named=not task.nouns.keys().isdisjoint(task.objects),
+            servos=bool(get_robot(config.robot).servos),
         )
 
 
