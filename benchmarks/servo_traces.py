@@ -48,11 +48,11 @@ class Trace(NamedTuple):
     motion: ArmMotion
     arm: ServoArm
 
-    def positions(self, servos: F64) -> F64:
+    def positions(self, servos: F64, *, quick: bool = False) -> F64:
         """Return the positions of its goals with servos (L, 1, 8), (L, T, 1) [rad]."""
         servos = servos.copy()  # an arm has LeRobot's gain
         servos[..., PARAMETERS.index("stiffness")] *= self.gain / GAIN
-        return self.arm.positions(servos, self.motion)
+        return self.arm.positions(servos, self.motion, quick=quick)
 
 
 class Pendulums(Arm):
@@ -62,9 +62,9 @@ class Pendulums(Arm):
         self.fps = FPS
         self._traces = {id(one.motion): one for one in traces}
 
-    def positions(self, servos: F64, motion: ArmMotion) -> F64:
+    def positions(self, servos: F64, motion: ArmMotion, *, quick: bool = False) -> F64:
         """Return the positions of a recording's goals, (L, T, 1) [rad]."""
-        return self._traces[id(motion)].positions(servos)
+        return self._traces[id(motion)].positions(servos, quick=quick)
 
 
 def read(tree: dict[str, Any]) -> Trace:

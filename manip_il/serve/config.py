@@ -17,9 +17,7 @@ class SessionConfig(Seeded):
     output_dir: Path = option(
         Path("runs/serve"), "folder of the ports follower and leader, and of their calibrations"
     )
-    leader: Literal["expert", "sliders", "none"] = option(
-        "expert", "who moves the leader arm; sliders: you, in a window"
-    )
+    leader: Literal["expert", "none"] = option("expert", "who moves the leader arm")
     speed: float = option(
         1.0,
         "how fast time passes in the world; 2: twice as fast as real time",

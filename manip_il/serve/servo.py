@@ -90,7 +90,8 @@ class Follower:
             goal = self.goal()
             dead = STEP * bus["CW_Dead_Zone"]
             limit = np.minimum(bus["Max_Torque_Limit"], bus["Torque_Limit"]) / 1000
-        servos.hold(data, self._on & ~on)
+        if (off := self._on & ~on).any():
+            servos.hold(data, off)
         self._on = on
         servos.command(
             self._world.model,

@@ -3,32 +3,26 @@ and close them.
 """
 
 import contextlib
-import copy
 import gc
 import select
 import signal
 import sys
 from collections.abc import Callable, Sequence
 
-import numpy as np
-
 from manip_il.errors import ManipError, UsageError
-from manip_il.mdp import F64, Actor
+from manip_il.mdp import Actor
 from manip_il.serve.cameras import RATE, Cameras
 from manip_il.serve.config import SessionConfig
 from manip_il.serve.episodes import ServedEpisodes
 from manip_il.serve.operator import INTERRUPT, Operator, weigh_session
-from manip_il.serve.station import Mover, Station
+from manip_il.serve.station import Station
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
-from manip_il.sim.view import Window
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.ladder.world import WORLD
 from manip_il.worlds.table import env_spec, world_of
 
 Say = Callable[[str], None]
-# a window's frame rate, so high that it never waits: the station keeps real time [Hz]
-_UNPACED = 1e6
 
 
 def serve(
@@ -51,7 +45,7 @@ def serve(
 
     Raises:
         UsageError: If the robot has no Feetech servos, or the cameras' port is taken.
-        RenderError: If there is no display for the window, or no off-screen OpenGL for the cameras.
+        RenderError: If there is no off-screen OpenGL for the cameras.
         ManipError: If the program failed.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -64,10 +58,7 @@ def serve(
         stack.callback(station.close)
         if cameras is not None:
             stack.callback(Cameras(station, cameras, config.camera_port).close)
-        if config.leader == "sliders":
-            leader = slider_mover(station)
-        else:
-            leader = station.expert if config.leader == "expert" else lambda: None
+        leader = station.expert if config.leader == "expert" else lambda: None
         episodes = ServedEpisodes(station, env, config.log, config.seed, leader)
         gc.collect()
         # a full collection of what LeRobot and torch have imported takes longer than a client waits
@@ -113,25 +104,6 @@ def described(station: Station, config: SessionConfig, cameras: CameraConfig | N
         f'--dataset.single_task="{station.env.task_description}" --dataset.push_to_hub=false '
         f"--dataset.fps={station.env.config.control_hz}",
     ]
-
-
-def slider_mover(station: Station) -> Mover:
-    """Open a window with sliders that move the leader; return the mover.
-
-    Raises `RenderError` without a display.
-    """
-    env, window = station.env, Window(station.env.scene, _UNPACED, sliders=True)
-    order, seed = np.array([*env.scene.arm_ctrl, *env.scene.gripper.ctrl]), None
-
-    def move() -> F64:
-        nonlocal seed
-        joints = window.commands[order] if seed == station.seed else station.follower.q
-        seed, shown = station.seed, copy.copy(env.data)
-        shown.ctrl[order] = joints
-        window.show(shown, env.world.variation)
-        return joints
-
-    return move
 
 
 def _operate(operator: Operator, station: Station, program: str, say: Say) -> None:

@@ -139,7 +139,7 @@ class ArmServos:
         set_joints(model, self.dof, self._memory(data)[:_COUNT].T)
 
     def hold(self, data: mujoco.MjData, which: NDArray[np.bool_] | slice = slice(None)) -> None:
-        """Make the current positions of joints their goals, since ever."""
+        """Make the current positions of joints, of all (n,) by default, their goals since ever."""
         self._memory(data)[_RAMP:, which] = data.qpos[self.q[which]]
 
     def of(self, data: mujoco.MjData, name: str) -> F64:
@@ -193,18 +193,18 @@ class ArmServos:
             dead: Position errors below which a servo does nothing [rad].
         """
         memory = self._memory(data)
+        values = dict(zip(PARAMETERS, memory, strict=False))
         told, q = memory[_TOLD:], data.qpos[self.q]
-        told[1:] = told[:-1].copy()
+        told[1:] = told[:-1]
         told[0] = goal
-        late = np.rint(self.of(data, "delay") / self._step).astype(int)
+        late = np.rint(values["delay"] / self._step).astype(int)
         goal = told[late, self._joints]
-        most, play = self.of(data, "speed") * self._step, np.radians(self.of(data, "play")) / 2
+        most, play = values["speed"] * self._step, np.radians(values["play"]) / 2
         ramp, at = follow(memory[_RAMP], memory[_AT], goal, most, play)
         memory[_RAMP], memory[_AT] = ramp, at
         data.ctrl[self.ctrl] = np.where(np.abs(at - q) < dead, q, at)
         gain = self.gain(data) if gain is None else gain
-        torque = self.of(data, "torque") * limit
-        set_motors(model, self.ctrl, gain, self.of(data, "damping"), torque)
+        set_motors(model, self.ctrl, gain, values["damping"], values["torque"] * limit)
 
     def at(self, data: mujoco.MjData) -> F64:
         """Return where the springs of the servos pull [rad], (n,)."""

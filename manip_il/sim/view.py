@@ -5,8 +5,8 @@ are applied to it and undone for the next. Software rendering costs time per tri
 Panda's meshes have 136,040 for an arm that is 60 pixels tall.
 
 The window is MuJoCo's own viewer, in real time, if there is a display. It shows a copy of the
-physics, too: changes in its panels do not affect the episode, except that callers can use the
-control sliders (`commands`) and the pull of the mouse (`pull`).
+physics, too: nothing in it affects the episode, except that callers can use the pull of the mouse
+(`pull`).
 """
 
 import atexit
@@ -272,13 +272,12 @@ class Clock:
 class Window:
     """A window that shows a scene in real time."""
 
-    def __init__(self, scene: Scene, control_hz: float, *, sliders: bool = False):
+    def __init__(self, scene: Scene, control_hz: float):
         """Open the window.
 
         Args:
             scene: The scene.
             control_hz: How often per second `show` is called.
-            sliders: Whether to open the right panel, which has the control sliders.
 
         Raises:
             RenderError: If there is no display.
@@ -292,7 +291,7 @@ class Window:
         self._clock = Clock(control_hz)
         others = threading.enumerate()
         self._handle: Any = mujoco.viewer.launch_passive(
-            self._model, self._data, show_left_ui=False, show_right_ui=sliders
+            self._model, self._data, show_left_ui=False, show_right_ui=False
         )
         self._threads = [one for one in threading.enumerate() if one not in others]
         # before MuJoCo's own handlers, which do not wait for its threads and may crash
@@ -329,14 +328,6 @@ class Window:
                 self._handle.set_texts((None, None, text, ""))
             self._handle.sync()
         self._clock.wait()
-
-    @property
-    def commands(self) -> F64:
-        """Positions of the control sliders, in the actuators' units, (u,).
-
-        They are as shown last, or as moved since.
-        """
-        return self._data.ctrl.copy()
 
     def pull(self, data: mujoco.MjData) -> None:
         """Apply the mouse's pull on a body [N] to `data`, until the next call."""

@@ -10,7 +10,6 @@ from manip_il.errors import UsageError
 from manip_il.evaluation.suites import varied
 from manip_il.serve.config import SessionConfig
 from manip_il.serve.session import serve
-from manip_il.sim.view import has_display
 
 SERVO = "servo"  # a value of --vary
 
@@ -19,8 +18,6 @@ _IDLE = ("late", "random_actions", "dynamics")  # conditions that do not affect 
 
 def run_serve(options: ServeOptions) -> None:
     """Serve until the program ends or the user presses Ctrl-C."""
-    if options.session.get("leader") == "sliders" and not has_display():
-        raise UsageError("--leader=sliders opens a window, which needs a display; set DISPLAY")
     env = env_config(options.env)
     cameras = options.camera_config(env) if options.cameras else None
     if idle := [one for one in options.vary if one in _IDLE]:
