@@ -29,6 +29,16 @@ class SessionConfig(Seeded):
         f"{STS3215}; {STRONG}: strong and fast, without play, delay and friction; by default those"
         f" of the robot's YAML, or {STS3215} if it has none",
     )
+    latency: float = option(
+        0.0,
+        "how late the client's commands, and what it reads and sees, arrive [s]",
+        at_least=0,
+        at_most=2,
+    )
+    jitter: float = option(
+        0.0, "longest further delay, drawn for every message [s]", at_least=0, at_most=2
+    )
+    drop: float = option(0.0, "share of messages that are lost", at_least=0, at_most=0.99)
     camera_port: int = option(5599, "TCP port of the cameras (ZMQ)", at_least=1, at_most=65_535)
     reset: Literal["solved", "enter"] = option(
         "solved",

@@ -80,14 +80,17 @@ class Follower:
         """
         return self._bus.goals() - self.offset
 
-    def command(self) -> None:
-        """Set the motors from the registers; call this before every physics step."""
+    def command(self, goal: F64) -> None:
+        """Set the motors from the registers; call this before every physics step.
+
+        Args:
+            goal: The goals that have arrived [rad], (n,).
+        """
         servos, bus = self.servos, self._bus
         data = self._world.data
         with bus.lock:
             on = bus["Torque_Enable"] > 0
             gain = servos.gain(data, np.maximum(1, bus["P_Coefficient"]))
-            goal = self.goal()
             dead = STEP * bus["CW_Dead_Zone"]
             limit = np.minimum(bus["Max_Torque_Limit"], bus["Torque_Limit"]) / 1000
         if (off := self._on & ~on).any():
@@ -102,11 +105,11 @@ class Follower:
             np.where(on, dead, 0.0),
         )
 
-    def show(self) -> None:
-        """Write what the servos measure into their registers."""
+    def measured(self) -> tuple[F64, F64, F64]:
+        """Return positions [rad], speeds [rad/s] and loads that the servos measure, (n,) each."""
         data, servos = self._world.data, self.servos
         load = data.actuator_force[servos.ctrl] / servos.of(data, "torque")
-        self._bus.show(self.q + self.offset, data.qvel[servos.dof], load)
+        return self.q + self.offset, data.qvel[servos.dof].copy(), load
 
 
 def draw_offset(config: SessionConfig, joints: Sequence[str], rng: np.random.Generator) -> F64:

@@ -19,6 +19,7 @@ from manip_il.robots.table import get_robot
 from manip_il.seeding import rng_for
 from manip_il.serve.bus import STEPS, Bus, Calibration, encoder_steps
 from manip_il.serve.config import SessionConfig
+from manip_il.serve.link import Link
 from manip_il.serve.servo import Follower, draw_offset, with_servos
 from manip_il.sim.conditions import Condition
 from manip_il.sim.view import Clock
@@ -47,6 +48,20 @@ class Read(NamedTuple):
     state: State
     told: F64
     commands: int
+
+
+class Seen(NamedTuple):
+    """What can be seen of the world at a moment.
+
+    Attributes:
+        measured: What the follower's servos measure, as `Follower.measured` returns it.
+        state: State of the world.
+        scene: `qpos`, `mocap_pos` and `mocap_quat` of MuJoCo, for cameras.
+    """
+
+    measured: tuple[F64, F64, F64]
+    state: State
+    scene: tuple[F64, F64, F64]
 
 
 class Station:
@@ -164,6 +179,9 @@ class Station:
         names = self.env.scene.robot.joint_names
         self.follower.reset(draw_offset(self._config, names, rng_for(seed, "encoders")))
         self._place_leader(self.follower.q)
+        self._views = Link(self._config, self._look(), rng_for(seed, "views"))
+        self._orders = Link(self._config, self.follower.goal(), rng_for(seed, "orders"))
+        self._ordered = self.follower.goal()
         self._show()
 
     def run(self, each_step: Callable[[], bool]) -> None:
@@ -188,11 +206,17 @@ class Station:
 
     def _tick(self) -> None:
         """Command the motors for a physics step, once it is time for it."""
+        now = self._ticks * self.env.config.physics_step
         if self._ticks % TICK == 0:
+            goal = self.follower.goal()
+            if (goal != self._ordered).any():
+                self._orders.send(now, goal)
+                self._ordered = goal
+            self._views.send(now, self._look())
             self._show()
             self.clock.wait()
         self._ticks += 1
-        self.follower.command()
+        self.follower.command(self._orders.receive(now))
 
     def _place_leader(self, q: F64) -> None:
         self._leader = q.copy()
@@ -209,14 +233,19 @@ class Station:
         self._leader = self._leader + np.clip(wanted - self._leader, -most, most)
         bus.show(self._leader)
 
-    def _show(self) -> None:
-        """Update what clients and cameras see."""
+    def _look(self) -> Seen:
         # shown without a knock that may follow
         data, state = self.env.data, replace(self.env.get_state(), begun=True)
-        self.seen = data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()
+        scene = data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()
+        return Seen(self.follower.measured(), state, scene)
+
+    def _show(self) -> None:
+        """Update what clients and cameras see."""
+        arrived = self._views.receive(self._ticks * self.env.config.physics_step)
+        self.seen = arrived.scene
         with self.buses["follower"].lock:
-            self.follower.show()
-            self._shown = state
+            self.buses["follower"].show(*arrived.measured)
+            self._shown = arrived.state
 
     def to_joints(self, action: F64) -> F64:
         """Return the joints [rad], (n,), that an action (n,) commands."""

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,14 +18,15 @@ from lerobot.teleoperators.so_leader import SO101Leader, SOLeaderTeleopConfig
 from manip_il.cli.main import main
 from manip_il.errors import UsageError
 from manip_il.serve.config import SessionConfig
+from manip_il.serve.link import Link
 from manip_il.serve.station import Station
 from manip_il.worlds.table import make_config
 
 from ..cli.made_runs import files
 
 
-def station_of(folder: Path, servo: str = "sts3215", robot: str = "so101") -> Station:
-    station = Station(make_config(robot, "lift"), SessionConfig(output_dir=folder, servo=servo))
+def station_of(folder: Path, robot: str = "so101", **session: Any) -> Station:
+    station = Station(make_config(robot, "lift"), SessionConfig(output_dir=folder, **session))
     station.reset(1)
     return station
 
@@ -72,7 +74,7 @@ def told(station: Station, joint: int, degrees: float) -> None:
 @pytest.mark.parametrize(("servo", "most"), [("ideal", 0.6), ("sts3215", 6.0)])
 def test_joints_go_where_they_are_told(tmp_path: Path, servo: str, most: float):
     """Ideal servos to within a fraction of a degree; real ones sag and have play."""
-    station = station_of(tmp_path, servo)
+    station = station_of(tmp_path, servo=servo)
     before = station.env.world.measured
     told(station, 0, 20.0)
     run(station, 2.0)
@@ -80,6 +82,40 @@ def test_joints_go_where_they_are_told(tmp_path: Path, servo: str, most: float):
     assert moved[0] == pytest.approx(20.0, abs=most)
     assert np.abs(moved[1:5]).max() < most
     station.close()
+
+
+def test_commands_and_readings_are_late(tmp_path: Path):
+    late = 0.3
+    station = station_of(tmp_path, servo="ideal", latency=late)
+    told(station, 0, 20.0)
+    before, read = station.follower.q[0], station.buses["follower"]["Present_Position"][0]
+    run(station, late - 0.05)
+    assert station.follower.q[0] == pytest.approx(before, abs=1e-3)
+    run(station, 0.3)
+    assert station.follower.q[0] > before + 0.1
+    assert station.buses["follower"]["Present_Position"][0] == pytest.approx(read, abs=2)
+    run(station, 1.0)
+    assert station.buses["follower"]["Present_Position"][0] > read + 100
+    station.close()
+
+
+def test_of_messages_the_last_that_was_sent_counts_and_some_are_lost():
+    link = Link(SessionConfig(latency=0.1, jitter=0.2, drop=0.25), -1, np.random.default_rng(0))
+    arrived = []
+    for number in range(2000):
+        link.send(number * 0.01, number)
+        arrived.append(link.receive(number * 0.01))
+    assert arrived == sorted(arrived)
+    assert arrived[:10] == [-1] * 10
+    late = np.arange(2000)[100:] - arrived[100:]
+    assert late.min() >= 10
+    assert late.max() <= 35
+    always = Link(SessionConfig(drop=0.25), -1, np.random.default_rng(0))
+    kept = set()
+    for number in range(2000):
+        always.send(number, number)
+        kept.add(always.receive(number))
+    assert len(kept) == pytest.approx(1500, abs=100)
 
 
 def test_an_arm_whose_torque_is_off_stays(station: Station):
