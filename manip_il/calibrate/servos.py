@@ -132,7 +132,7 @@ def parameters(deviations: F64) -> F64:
     for place, name in enumerate(PARAMETERS):
         if name in ADDED:
             values[..., place] = default[place] + ADDED[name] * deviations[..., place]
-    return np.clip(values, *BOUNDS)
+    return np.clip(values, *np.array([*BOUNDS.values()]).T)
 
 
 def _lowest() -> F64:

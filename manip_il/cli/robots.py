@@ -20,7 +20,6 @@ from manip_il.cli.common_options import (
 from manip_il.cli.outputs import Output, Replacing, output_folder
 from manip_il.cli.parsing import Given, given
 from manip_il.option import NameOrPath, Seeded, option
-from manip_il.robots.servos import ServoConfig
 from manip_il.serve.config import SessionConfig
 from manip_il.tasks import NAMES
 from manip_il.worlds.config import EnvConfig
@@ -67,7 +66,6 @@ class ServeOptions(Varied):
     )
     env: Given = given(EnvConfig, robot="so101")
     session: Given = given(SessionConfig, prefix="")
-    servos: ServoConfig = field(default_factory=ServoConfig)
 
 
 @dataclass(frozen=True)

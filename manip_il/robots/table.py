@@ -22,6 +22,7 @@ from manip_il.robots.robot import (
     place,
     read,
 )
+from manip_il.robots.servos import servos_of
 from manip_il.robots.spec import arm_joints
 
 SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
@@ -59,7 +60,7 @@ def read_robot(path: Path) -> Robot:
             raise ManipError(f"a built-in robot is called {path.stem}; rename the file")
         said = _said(path, read_yaml(path, "a robot's YAML"))
         if EXTENDS in said:
-            base = _base(said.pop(EXTENDS), path)
+            base = said.pop(EXTENDS)
             return replace(base, **said | {"cameras": {**base.cameras, **said.get("cameras", {})}})
         if all(name in said for name in FOUND):
             return Robot(**said)
@@ -98,7 +99,9 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
         tree["hand"] = checks.mapping("ee", tree["ee"]).get("body")
     said: dict[str, Any] = {"name": checks.name("a robot's name", path.stem)}
     if EXTENDS in tree:
-        said[EXTENDS] = tree.pop(EXTENDS)
+        said[EXTENDS] = base = _base(tree.pop(EXTENDS), path)
+        if isinstance(named := tree.get("servos"), str):
+            tree["servos"] = servos_of(named, base.joint_names)
     else:
         for name in ("model", "hand", "gripper", "workspace"):
             if name not in tree:

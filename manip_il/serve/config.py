@@ -1,11 +1,11 @@
 """Settings of sessions. Importing this module does not load the simulator."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from manip_il.option import Seeded, option
-from manip_il.robots.servos import STRONG, STS3215, ServoConfig
+from manip_il.robots import NAMED_SERVOS
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class SessionConfig(Seeded):
     )
     servo: str = option(
         "",
-        f"{STS3215}; {STRONG}: strong and fast, without play, delay and friction; by default those"
-        f" of the robot's YAML, or {STS3215} if it has none",
+        f"{' or '.join(NAMED_SERVOS)} (strong, fast and exact); by default those of the robot's YAML,"
+        f" or {NAMED_SERVOS[0]} if it has none",
     )
     latency: float = option(
         0.0,
@@ -54,5 +54,4 @@ class SessionConfig(Seeded):
     log: Path | None = option(
         None, "folder for journals with what the client cannot see: states, labels, who drove"
     )
-    servos: ServoConfig = field(default_factory=ServoConfig)
     varies: bool = False  # whether to redraw the servos for each world

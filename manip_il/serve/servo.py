@@ -1,41 +1,37 @@
 """The servos of a bus as the motors of a simulated arm."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import UsageError
 from manip_il.mdp import F64
+from manip_il.robots import NAMED_SERVOS
 from manip_il.robots.robot import Robot
-from manip_il.robots.servos import IDEAL, STRONG, STS3215, ServoConfig, servos_like
+from manip_il.robots.servos import servos_of
 from manip_il.serve.bus import STEP, Bus
-from manip_il.serve.config import SessionConfig
 from manip_il.sim.servo import ArmServos
 from manip_il.sim.world import World
 
 _HAND = 100.0  # stiffness of a hand that holds an arm whose torque is off [N m/rad]
 
 
-def with_servos(robot: Robot, config: SessionConfig) -> Robot:
-    """Return a robot with the servos of a session: its YAML's own, or those that are named.
+def with_servos(robot: Robot, name: str) -> Robot:
+    """Return a robot with servos: its YAML's own, or those that are named.
 
     Args:
         robot: The robot.
-        config: Options of the session.
+        name: A name in `NAMED_SERVOS`; empty for its own, or the first of these if it has none.
 
     Raises:
         UnknownName: If there are no such servos.
         UsageError: If the robot has servos of its own and others are named.
     """
-    if robot.servos:
-        if config.servo or config.servos != ServoConfig():
-            raise UsageError(f"{robot.name} has servos in its YAML; leave out --servo, --servos.*")
-        return robot
-    if config.servo not in ("", STS3215, STRONG):
-        raise UnknownName("servo", config.servo, (STS3215, STRONG))
-    servos = replace(config.servos, **IDEAL) if config.servo == STRONG else config.servos
-    return replace(robot, servos=servos_like(servos, robot.joint_names))
+    if not robot.servos:
+        return replace(robot, servos=servos_of(name or NAMED_SERVOS[0], robot.joint_names))
+    if name:
+        raise UsageError(f"{robot.name} has servos in its YAML; leave out --servo")
+    return robot
 
 
 class Follower:
@@ -110,10 +106,3 @@ class Follower:
         data, servos = self._world.data, self.servos
         load = data.actuator_force[servos.ctrl] / servos.of(data, "torque")
         return self.q + self.offset, data.qvel[servos.dof].copy(), load
-
-
-def draw_offset(config: SessionConfig, joints: Sequence[str], rng: np.random.Generator) -> F64:
-    """Return errors of the joints' encoders [rad], (n,), which differ if servos vary."""
-    value, low, high = config.servos.range_of("offset")
-    count = len(joints)
-    return np.radians(rng.uniform(low, high, count) if config.varies else np.full(count, value))

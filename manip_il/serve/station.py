@@ -20,7 +20,7 @@ from manip_il.seeding import rng_for
 from manip_il.serve.bus import STEPS, Bus, Calibration, encoder_steps
 from manip_il.serve.config import SessionConfig
 from manip_il.serve.link import Link
-from manip_il.serve.servo import Follower, draw_offset, with_servos
+from manip_il.serve.servo import Follower, with_servos
 from manip_il.sim.conditions import Condition
 from manip_il.sim.view import Clock
 from manip_il.worlds.config import EnvConfig
@@ -29,6 +29,7 @@ from manip_il.worlds.ladder.world import LadderEnv
 
 FEETECH = "so_follower"  # LeRobot's `robot_type` of arms with these servos
 TICK = 4  # physics steps between moments at which clients read and write: 8 ms at 480 Hz
+OFFSET = np.radians(1.0)  # largest error of an encoder whose servo varies [rad]
 HELD = 1.0  # how long the task must stay solved before it counts [s]
 _FULL_TURN = "wrist_roll"  # the joint whose range is a full turn in LeRobot's calibration
 
@@ -103,7 +104,7 @@ class Station:
                 f"--robot.type={robot.name} has no Feetech servos; expected so101, or the YAML of"
                 f" an arm with lerobot.robot_type: {FEETECH}"
             )
-        env = LadderEnv(named, None, conditions, with_servos(robot, config))
+        env = LadderEnv(named, None, conditions, with_servos(robot, config.servo))
         servos = env.scene.servos
         assert servos is not None
         self.env, self._config = env, config
@@ -174,10 +175,11 @@ class Station:
         self.env.start(seed)
         self.seed, self._solved = seed, 0
         world, servos = self.env.world, self.follower.servos
+        offset = np.zeros(len(servos.q))
         if self._config.varies:
             servos.begin(world.model, world.data, servos.draw(rng_for(seed, "servos"), 1.0))
-        names = self.env.scene.robot.joint_names
-        self.follower.reset(draw_offset(self._config, names, rng_for(seed, "encoders")))
+            offset = rng_for(seed, "encoders").uniform(-OFFSET, OFFSET, len(offset))
+        self.follower.reset(offset)
         self._place_leader(self.follower.q)
         self._views = Link(self._config, self._look(), rng_for(seed, "views"))
         self._orders = Link(self._config, self.follower.goal(), rng_for(seed, "orders"))

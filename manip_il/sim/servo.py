@@ -122,8 +122,8 @@ class ArmServos:
             rng: Generator to draw from.
             share: How much of the distance from the values to the drawn ones is gone, 0 to 1.
         """
-        values, low, high = self.ranges
-        return values + share * (rng.uniform(low, high) - values)
+        values, ends = self.ranges[0], self.ranges[1:]
+        return values + share * (rng.uniform(*ends) - values)
 
     def _memory(self, data: mujoco.MjData) -> F64:
         return data.userdata.reshape(-1, len(self.q))

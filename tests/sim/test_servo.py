@@ -1,15 +1,16 @@
 """An arm with servos: late, limited in speed, and whole in its state."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.errors import UsageError
+from manip_il.errors import ManipError
 from manip_il.mdp import F64, State
-from manip_il.robots.servos import PARAMETERS, ServoConfig, servo_ranges, servos_like
+from manip_il.robots import NAMED_SERVOS
+from manip_il.robots.servos import PARAMETERS, default_servo, servo_ranges, servos_of
 from manip_il.robots.table import get_robot
 from manip_il.sim.conditions import Condition
 from manip_il.worlds.ladder.expert import LadderExpert
@@ -22,7 +23,9 @@ PAN = 0  # the joint about the vertical, on which gravity does not act
 
 def env_of(**servo: float) -> LadderEnv:
     """Return the environment of an SO-101 with such servos, which vary."""
-    robot = replace(SO101, servos=servos_like(ServoConfig(**servo), SO101.joint_names))
+    own = {name: (value,) * 3 for name, value in servo.items()}
+    usual = servos_of("sts3215", SO101.joint_names)
+    robot = replace(SO101, servos={joint: {**one, **own} for joint, one in usual.items()})
     varied = [Condition("servo", servo=1)] if not servo else []
     return LadderEnv(make_config("so101", "lift"), None, varied, robot)
 
@@ -52,9 +55,9 @@ def test_the_goal_moves_no_faster_than_its_speed():
 
 
 def test_a_joint_at_rest_is_within_friction_and_play_of_its_goal():
-    servo = ServoConfig()
-    most = servo.friction / (servo.stiffness / 2) + np.radians(servo.play) / 2
-    assert abs(step_of(env_of(stiffness=servo.stiffness), 0.5)[-1] - 0.5) <= most + 1e-3
+    servo = dict(zip(PARAMETERS, default_servo(), strict=True))
+    most = servo["friction"] / (servo["stiffness"] / 2) + np.radians(servo["play"]) / 2
+    assert abs(step_of(env_of(stiffness=servo["stiffness"]), 0.5)[-1] - 0.5) <= most + 1e-3
     assert step_of(env_of(friction=0.0, play=0.0), 0.5)[-1] == pytest.approx(0.5, 1e-3)
 
 
@@ -72,7 +75,7 @@ def driven():
 def test_a_restored_state_has_its_servos_and_goes_on_the_same(driven):
     env, expert = driven
     state = State.from_vector(env.get_state().to_vector())
-    other = env_of(delay=ServoConfig().delay)
+    other = env_of()
     other.start(5)
     other.advance(other.world.measured)
     other.set_state(state)
@@ -112,6 +115,7 @@ def test_the_expert_solves_the_task_through_the_servos(driven):
         ({"hand": "gripper", "model": "x.xml"}, "model"),
         ({"servos": {"shoulder_pan": {}}}, "servos has shoulder_pan; expected"),
         ({"servos": {"shoulder_pan": 3}}, "servos"),
+        ({"servos": "mg996"}, "sts3215"),
     ],
 )
 def test_a_wrong_yaml_is_one_line(
@@ -126,9 +130,13 @@ def test_a_wrong_yaml_is_one_line(
     assert said in line
 
 
+@pytest.mark.parametrize("name", NAMED_SERVOS)
+def test_named_servos_are_within_the_bounds_and_their_ranges(name: str):
+    values, low, high = servo_ranges(servos_of(name, ["pan.pos"]), ["pan.pos"])
+    assert ((low <= values) & (values <= high)).all()
+
+
 def test_values_out_of_bounds_are_named():
-    servos = {"pan": {name: (value, value, value) for name, value in asdict(ServoConfig()).items()}}
-    del servos["pan"]["offset"]
-    servos["pan"]["delay"] = (3.0, 0.0, 0.0)
-    with pytest.raises(UsageError, match=r"servos.delay is 3"):
-        servo_ranges(servos, ["pan.pos"])
+    [servo] = servos_of("sts3215", ["pan"]).values()
+    with pytest.raises(ManipError, match=r"servos.pan.delay"):
+        servo_ranges({"pan": {**servo, "delay": (3.0, 0.0, 0.0)}}, ["pan.pos"])

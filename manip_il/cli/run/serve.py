@@ -21,13 +21,11 @@ def run_serve(options: ServeOptions) -> None:
     env = env_config(options.env)
     cameras = options.camera_config(env) if options.cameras else None
     if idle := [one for one in options.vary if one in _IDLE]:
-        raise UsageError(
-            f"--vary={idle[0]} changes nothing for a served arm; use --servos.*, or --vary=servo"
-        )
+        raise UsageError(f"--vary={idle[0]} changes nothing for a served arm; use --vary=servo")
     conditions = varied(
         [one for one in options.vary if one != SERVO], env, sees=cameras is not None
     )
-    session = SessionConfig(**options.session, servos=options.servos, varies=SERVO in options.vary)
+    session = SessionConfig(**options.session, varies=SERVO in options.vary)
     with exclusive(session.output_dir):
         require_ours(session.output_dir, output_of("Serve"))
         save_options(session.output_dir, replace(options, command=[]))  # which may hold secrets
