@@ -26,8 +26,8 @@ class SessionConfig(Seeded):
     )
     servo: str = option(
         "",
-        f"{' or '.join(NAMED_SERVOS)} (strong, fast and exact); by default those of the robot's YAML,"
-        f" or {NAMED_SERVOS[0]} if it has none",
+        f"{' or '.join(NAMED_SERVOS)} (strong, fast and exact); by default those of the robot's"
+        f" YAML, or {NAMED_SERVOS[0]} if it has none",
     )
     latency: float = option(
         0.0,
