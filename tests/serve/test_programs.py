@@ -21,7 +21,6 @@ from manip_il.data.journal import list_episodes, read_journal
 from manip_il.mdp import Actor, Episode
 from manip_il.serve.config import SessionConfig
 from manip_il.serve.station import Station
-from manip_il.worlds.ladder.world import LadderEnv
 from manip_il.worlds.table import make_config
 
 pytestmark = pytest.mark.slow
@@ -122,10 +121,8 @@ def ends(folder: Path) -> NDArray[np.int64]:
 
 def test_an_arm_is_calibrated(run: Run, tmp_path: Path):
     """The calibration that is found is the model's, to within two steps; the servos keep it."""
-    Station(
-        LadderEnv(make_config("so101", "lift")),
-        SessionConfig(output_dir=tmp_path / "model" / "arm"),
-    ).close()
+    folder = tmp_path / "model" / "arm"
+    Station(make_config("so101", "lift"), SessionConfig(output_dir=folder)).close()
     model = ends(tmp_path / "model")
     run("lerobot-calibrate", arms="follower")
     assert "Calibration saved" in (tmp_path / "said").read_text()
