@@ -410,8 +410,8 @@ class Robot:
             patterns win.
         lerobot: How LeRobot's recorder writes the robot; its servos' units then replace [rad]
             and [m].
-        servos: How the servos move, by joint and parameter: value, and the ends of its range. None:
-            they are ideal, and gravity does not act on the arm.
+        servos: How the servos move, by joint and parameter: value, and the ends of its range.
+            Empty: they are ideal, and gravity does not act on the arm.
     """
 
     name: str

@@ -51,7 +51,8 @@ def servo_ranges(servos: Servos, joints: Sequence[str]) -> F64:
         joints: Names of the n joints.
 
     Raises:
-        ManipError: If a joint or a parameter is missing, unknown or out of `BOUNDS`.
+        ManipError: If a joint or a parameter is missing, unknown or out of `BOUNDS`, or a
+            value is out of its range.
     """
     names = [joint.removesuffix(".pos") for joint in joints]
     for what, found, wanted in (
@@ -65,6 +66,8 @@ def servo_ranges(servos: Servos, joints: Sequence[str]) -> F64:
         for name, ends in one.items():
             for end in ends:
                 checks.number(f"servos.{joint}.{name}", end, *BOUNDS[name])
+            if not ends[1] <= ends[0] <= ends[2]:
+                raise ManipError(f"servos.{joint}.{name} is {[*ends]}; expected [value, low, high]")
     table = np.array([[servos[joint][name] for name in PARAMETERS] for joint in names], float)
     return table.transpose(2, 0, 1)
 

@@ -140,3 +140,5 @@ def test_values_out_of_bounds_are_named():
     [servo] = servos_of("sts3215", ["pan"]).values()
     with pytest.raises(ManipError, match=r"servos.pan.delay"):
         servo_ranges({"pan": {**servo, "delay": (3.0, 0.0, 0.0)}}, ["pan.pos"])
+    with pytest.raises(ManipError, match=r"servos.pan.delay .* expected \[value, low, high\]"):
+        servo_ranges({"pan": {**servo, "delay": (0.1, 0.2, 0.3)}}, ["pan.pos"])
