@@ -149,9 +149,10 @@ class DemoOptions(EngineOptions, ResumableOutput):
     """Run a small complete example: the expert demonstrates, a policy is cloned, DAgger improves
     it.
 
-    Compares the expert, the cloned policy, a policy cloned from as many labels as DAgger used, and
-    DAgger's best round on the same unseen seeds, undisturbed and disturbed; OUTPUT_DIR/report.html
-    shows the result. The policies are mlps; for other kinds use manip-il train and manip-il dagger.
+    Compares the expert, the cloned policy, a policy cloned from as many labels of disturbed
+    demonstrations as DAgger used, and DAgger's best round on the same unseen seeds, undisturbed and
+    disturbed; OUTPUT_DIR/report.html shows the result. The policies are mlps; for other kinds use
+    manip-il train and manip-il dagger.
 
     Example: manip-il demo --output_dir=runs/demo
     """

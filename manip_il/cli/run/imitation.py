@@ -45,6 +45,7 @@ from manip_il.evaluation.suites import varied
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.names import CNN
+from manip_il.sim.events import standard_in
 from manip_il.worlds.config import EnvConfig
 
 
@@ -121,11 +122,13 @@ def run_demo(options: DemoOptions) -> None:
     verdict, *facts = (
         prefix + Comparison(tested[place], tested[-1]).verdict
         for prefix, tested in (("", sides), ("Disturbed: ", disturbed))
-        for place in (2, 1)  # cloning from as many labels, then round 0
+        for place in (1, 2)  # round 0, then cloning from as many labels
     )
-    facts.append(
-        f"{config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was."
-    )
+    if config.disturbed_share:
+        facts.append(
+            f"{config.disturbed_share:.0%} of DAgger's rollouts and all demonstrations of the"
+            " second cloned policy were disturbed."
+        )
     page = run_report(
         sides,
         [Side("DAgger", (read_member(folder / "dagger"),))],
@@ -150,24 +153,27 @@ def run_demo(options: DemoOptions) -> None:
 def _measure(
     options: DemoOptions, config: RunConfig, folder: Path, engine: Engine, stages: Stages
 ) -> list[Side]:
-    """Run DAgger, clone from as many labels, and test both, round 0 and the expert (policy
-    None).
+    """Run DAgger, clone disturbed demonstrations with as many labels, and test both, round 0 and
+    the expert (policy None).
     """
     results = dagger(folder / "dagger", config, workers=engine, progress=stages)
     first, best = results[0], best_result(results)
     most = results[-1].labels
-    run = Run(replace(config, label_budget=most), folder / f"cloning_{most}", engine, stages)
+    # disturbed as DAgger's rollouts are, so that the difference is the algorithm's
+    conditions = (standard_in(config.conditions),) if config.disturbed_share else config.conditions
+    disturbed = replace(config, label_budget=most, conditions=conditions)
+    run = Run(disturbed, folder / f"cloning_{most}", engine, stages)
     more = run.demonstrations(math.ceil(ENOUGH * config.demonstrations * most / first.labels))
     policy = run.fit([more]).path
     contestants = (
         ("expert", None, None),
         ("cloning", first.policy, first.labels),
-        ("cloning with as many labels", policy, more.labels),
+        ("cloning, disturbed, as many labels", policy, more.labels),
         (f"DAgger (round {best.number})", best.policy, best.labels),
     )
     sides = [Side(name, (Member(Path(name), policy=path),), n) for name, path, n in contestants]
     envs = dict.fromkeys((side.name for side in sides), config.env)
-    nominal, disturbed = (
+    nominal, knocked = (
         measure_sides(
             sides,
             envs,
@@ -185,7 +191,7 @@ def _measure(
     )
     return [
         replace(side, disturbed=other.results[0])
-        for side, other in zip(nominal, disturbed, strict=True)
+        for side, other in zip(nominal, knocked, strict=True)
     ]
 
 
