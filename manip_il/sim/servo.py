@@ -17,7 +17,10 @@ from manip_il.robots.servos import FACTORY_GAIN, GAIN, PARAMETERS, servo_ranges
 _DRY = 0.999, 0.9999  # of MuJoCo's friction, which lets joints creep at its default
 _SHORT = 0.01  # way from which on friction and play are fully compensated [rad]
 _COUNT = len(PARAMETERS)
-_RAMP, _AT, _TOLD = _COUNT, _COUNT + 1, _COUNT + 2  # rows of a memory after the parameters
+# rows of a memory after the parameters
+_RAMP = _COUNT
+_AT = _COUNT + 1
+_TOLD = _COUNT + 2
 Per = float | F64
 
 

@@ -18,7 +18,7 @@ from manip_il.sim.config import CameraConfig
 from manip_il.sim.render import LOOK_VERSION as DRAWN
 from manip_il.sim.render import REMEDY
 from manip_il.sim.view import simplify_meshes
-from manip_il.worlds.aloha.expert import Arm, label
+from manip_il.worlds.aloha.expert import ArmExpert, label
 from manip_il.worlds.aloha.insertion import Insertion
 from manip_il.worlds.aloha.ladder import SIDES, AlohaScene, phases, read_hand
 from manip_il.worlds.aloha.transfer import Transfer
@@ -83,7 +83,9 @@ class Aloha(GymWorld):
         self._task.get_observation = lambda _: None
         env._format_raw_obs = lambda _: np.empty(0)
         env.action_space = gymnasium.spaces.Box(*_bounds(self.model), dtype=np.float64)
-        self._arms = {side: Arm(self.model, number, side) for number, side in enumerate(SIDES)}
+        self._arms = {
+            side: ArmExpert(self.model, number, side) for number, side in enumerate(SIDES)
+        }
         around = (
             coordinates(name) if np.ndim(value) else (name,)
             for name, value in self.scene().observed().items()

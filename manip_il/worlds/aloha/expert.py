@@ -26,7 +26,7 @@ CREEPS = 0.95  # share of the breakaway lead below which a joint creeps
 BREAKAWAY = 1.5  # step of a joint per lead beyond it
 
 
-def label(scene: AlohaScene, arms: Mapping[str, Arm], bias: F64) -> Label | str:
+def label(scene: AlohaScene, arms: Mapping[str, ArmExpert], bias: F64) -> Label | str:
     """Return the label of one state, or why there is no sound action.
 
     Args:
@@ -48,7 +48,7 @@ def label(scene: AlohaScene, arms: Mapping[str, Arm], bias: F64) -> Label | str:
     return Label(np.array(action), phases(type(scene)).index(", ".join(names)), True, 0.0)
 
 
-def _unsound(scene: AlohaScene, arms: Mapping[str, Arm]) -> str:
+def _unsound(scene: AlohaScene, arms: Mapping[str, ArmExpert]) -> str:
     if scene.arms_touch:
         return "the arms touch"
     for name, side in scene.grasped.items():
@@ -61,7 +61,7 @@ def _unsound(scene: AlohaScene, arms: Mapping[str, Arm]) -> str:
     return ""
 
 
-class Arm:
+class ArmExpert:
     """One arm: converts a target of its hand to targets of its joints, (6,) [rad].
 
     Args:
