@@ -118,8 +118,8 @@ class TheoryOptions(EngineOptions, Output):
     the arm.
 
     Writes report.html and theory.json. SOURCE is a run of `manip-il dagger`: for every round, the
-    policy's distribution shift and its excess cost are measured, and the cost is compared with
-    DAgger's bound.
+    policy's distribution shift and the gap between its value and the expert's are measured, and
+    the gap is compared with the bounds of cloning and DAgger.
 
     Example: manip-il theory runs/dagger --output_dir=runs/theory
     """

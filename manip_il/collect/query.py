@@ -94,8 +94,8 @@ def _probability(bound: float, setting: Setting) -> Gate:
 
 
 def _ensemble(bound: float, setting: Setting) -> Gate:
-    """Query if policies that differ by their seed disagree by more than the bound (Menda et al.
-    2019).
+    """Query if policies that differ by their seed disagree by more than the bound: the measure of
+    EnsembleDAgger (Menda et al. 2019), which decides by it who drives.
 
     Disagreement is the root mean square distance of their actions from the mean, in the worst
     dimension.
@@ -114,7 +114,8 @@ def _ensemble(bound: float, setting: Setting) -> Gate:
 
 
 def _safety(bound: float, setting: Setting) -> Gate:
-    """Query if expert and learner differ by more than the bound (Zhang & Cho 2017).
+    """Query if expert and learner differ by more than the bound: the measure of SafeDAgger (Zhang &
+    Cho 2017), which decides by it who drives.
 
     The expert labels every state for this comparison; the label is kept only if they differ that
     much.

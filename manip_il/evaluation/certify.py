@@ -1,15 +1,15 @@
 """Measure the expert's recoverability: rollouts with one perturbation, compared with the same
 rollouts undisturbed.
 
-The cost of a state is the number of control steps until the task is solved. If Q*(s, a) is the
-expert's cost after action a in state s, and V*(s) its cost if it acts itself from s on, the gap
-Q*(s, a) - V*(s) is what action a costs. Expert and simulator are deterministic, so the undisturbed
-run of a seed gives V* of every state in it, and the same run with one wrong action gives Q*.
+The reward is 1 in every control step after success. V(s) is what the expert gets from state s on,
+and Q(s, a) the same after action a, so V(s) - Q(s, a), the number of control steps by which success
+is later, is what action a costs. Expert and simulator are deterministic, so the undisturbed run of
+a seed gives V of every state in it, and the same run with one wrong action gives Q.
 
-Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest gap, u: a learner that
-errs in a share e of the states it visits within T steps costs at most u T e more than the expert,
-so the cost is linear in T if mistakes can be undone, not quadratic. Rajaraman et al. (2021) call
-this mu-recoverability. The largest gap among sampled actions, as here, is a lower bound of u.
+Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest such cost, u: a learner
+that errs in a share e of the H steps of its own episodes gets at most u H e less than the expert,
+so its loss is linear in H if mistakes can be undone, not quadratic. Rajaraman et al. (2021) call
+this mu-recoverability. The largest cost among sampled actions, as here, is a lower bound of u.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -89,7 +89,7 @@ class Row:
 
     @property
     def gaps(self) -> list[int]:
-        """Q*(s, a) - V*(s) of each wrong action [control steps].
+        """V(s) - Q(s, a), the cost of each wrong action [control steps].
 
         The whole horizon if the expert did not recover.
         """

@@ -3,7 +3,9 @@
 fit(D) = argmin over policies of the mean over D of -log pi(a* | s): empirical risk minimisation
 (imitation-learning chapter, Eqs. 8.2 to 8.4; the same reduction to supervised learning in
 Ross, Gordon and Bagnell, AISTATS 2011, section 2). A head defines the family of distributions
-pi(. | s). The network gives `params` (B, size) for B rows; targets (B, n) are in normalised units.
+pi(. | s). The likelihood is that of independent pairs (Eq. 8.2), which those of one episode are
+not, as an action decides the next state. The network gives `params` (B, size) for B rows; targets
+(B, n) are in normalised units.
 
 Acting is deterministic: one action per state. `mse` and `l1` do not model the spread.
 """

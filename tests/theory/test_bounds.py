@@ -11,6 +11,7 @@ from manip_il.chapter.theory.bounds import (
     WRONG,
     Process,
     curves,
+    dagger_bound,
     losses_of,
 )
 
@@ -97,14 +98,91 @@ def test_slopes_are_the_theorems_and_nothing_is_above_its_bound(process):
         assert curve.slope == pytest.approx(slope, abs=0.2)
 
 
-def test_any_policy_keeps_to_both_bounds(process):
-    rng = np.random.default_rng(0)
-    for horizon in (3, 12):
-        wrong = rng.random((20, horizon, process.states)) ** rng.integers(1, 20, (20, 1, 1))
-        policies = np.where(process.wrong_costs(horizon) <= 0, 0.0, wrong)
-        for learner in ("cloning", "DAgger"):
-            _, gaps, bounds = losses_of(process, learner, policies)
-            assert (gaps <= bounds + 1e-9).all()
+def random_process(rng: np.random.Generator) -> Process:
+    """A process of 2 to 5 states with any rewards, whose expert need not be optimal."""
+    states = rng.integers(2, 6)
+    moves = rng.dirichlet(np.full(states, 0.3), (2, states))
+    first = rng.dirichlet(np.ones(states))
+    return Process("random", "", moves, rng.random((2, states)), first, (0, 0))
+
+
+@pytest.fixture(scope="module")
+def random_processes() -> list[tuple[Process, np.ndarray]]:
+    """300 random processes, each with 20 random deterministic policies over 2 to 12 steps."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(300):
+        one = random_process(rng)
+        shape = (20, int(rng.integers(2, 13)), one.states)
+        found.append((one, (rng.random(shape) < rng.random((20, 1, 1))).astype(float)))
+    return found
+
+
+def test_the_theorem_on_cloning_holds_in_300_random_processes(random_processes):
+    for one, policies in random_processes:
+        _, gaps, bounds = losses_of(one, "cloning", policies)
+        assert (np.abs(gaps) <= bounds + 1e-9).all()
+
+
+def test_errors_in_own_states_cost_at_most_u_each_in_300_random_processes(random_processes):
+    better = 0
+    for one, policies in random_processes:
+        errors, gaps, bounds = losses_of(one, "DAgger", policies)
+        horizon = policies.shape[1]
+        assert (gaps <= bounds + 1e-9).all()
+        largest = np.abs(one.wrong_costs(horizon)).max()
+        assert (np.abs(gaps) <= dagger_bound(horizon, errors, largest) + 1e-9).all()
+        better += bool((np.abs(gaps) > bounds + 1e-9).any())
+    assert better > 0  # u does not limit how much better a policy is than the expert
+
+
+def test_without_u_the_theorem_on_dagger_holds_where_no_action_costs_more_than_one(
+    random_processes,
+):
+    cheap = 0
+    for one, policies in random_processes:
+        horizon = policies.shape[1]
+        if np.abs(one.wrong_costs(horizon)).max() <= 1:
+            errors, gaps, _ = losses_of(one, "DAgger", policies)
+            assert (np.abs(gaps) <= dagger_bound(horizon, errors, 1.0) + 1e-9).all()
+            cheap += 1
+    assert cheap > 100
+
+
+def test_without_u_it_fails_on_a_tightrope():
+    tightrope, horizon = PROCESSES[1], 40
+    policies = np.full((1, horizon, tightrope.states), 0.001)
+    errors, gaps, _ = losses_of(tightrope, "DAgger", policies)
+    assert (gaps > 10 * horizon * errors).all()
+
+
+@pytest.mark.parametrize("learner", ["cloning", "DAgger"])
+def test_both_bounds_are_reached_by_errors_in_the_first_step_of_a_tightrope(learner):
+    tightrope = PROCESSES[1]
+    policies = np.zeros((1, 40, tightrope.states))
+    policies[:, 0] = 0.01
+    _, gaps, bounds = losses_of(tightrope, learner, policies)
+    assert gaps == pytest.approx(bounds)
+    assert gaps > 0
+
+
+def values(process: Process, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """V (H + 1, S) and Q (2, H, S) of a policy, from the last step to the first."""
+    horizon = len(policy)
+    value, quality = np.zeros((horizon + 1, process.states)), np.zeros((2, *policy.shape))
+    for t in range(horizon - 1, -1, -1):
+        quality[:, t] = process.rewards + process.moves @ value[t + 1]
+        value[t] = (1 - policy[t]) * quality[RIGHT, t] + policy[t] * quality[WRONG, t]
+    return value, quality
+
+
+def test_the_gap_is_the_policys_advantages_along_the_experts_episodes(random_processes):
+    for one, policies in random_processes[::10]:
+        _, gaps, _ = losses_of(one, "DAgger", policies)
+        expert = np.zeros(policies.shape[1:])
+        for policy, gap in zip(policies, gaps, strict=True):
+            value, quality = values(one, policy)
+            advantages = quality[RIGHT] - value[:-1]
+            assert (one.visits(expert) * advantages).sum() == pytest.approx(gap, abs=1e-9)
 
 
 def test_u_is_what_one_wrong_step_costs():

@@ -1,11 +1,26 @@
 """Losses of cloning and DAgger over the horizon, compared with the bounds of two theorems.
 
-Theorem 8.1: a policy that errs in a share eps of the expert's states loses at most H^2 eps (Ross &
-Bagnell 2010). Theorem 8.2: a policy that errs in a share eps of its own states loses at most u H
-eps; u is the largest cost of one wrong step if the expert then drives (Ross et al. 2011, Theorem
-2.2; a bound stated as H eps hides u in its constant). The theorems are numbered as in the course,
-docs/course. Rewards are 0 to 1 per step. Policies are fitted to trajectories; in states without
-data they take the worst action, as the theorems allow.
+The theorems and equations are those of chapter 8 of A. Cai, An Introduction to Reinforcement
+Learning (2025). Rewards are 0 to 1 per step; V is the expected sum of rewards over H steps, and eps
+the expected share of the H steps of an episode in which the policy differs from the expert (Eq.
+8.5).
+
+Theorem 8.1: |V(expert) - V(policy)| <= H^2 eps, with eps in the expert's episodes (Ross & Bagnell
+2010). Theorem 8.2: |V(expert) - V(policy)| <= H eps after O~(H^2) rounds of DAgger, with high
+probability; eps is the error of the fits (Ross et al. 2011, Theorem 3.4, which has u H eps).
+
+Measured for DAgger is what that theorem rests on: V(expert) - V(policy) <= u H eps, with eps in the
+policy's own episodes; u is the largest cost of one wrong step if the expert then drives (Ross et
+al. 2011, Theorem 2.2). Without u this holds if u <= 1. It has no absolute value: u only limits what
+a policy can lose, and one may beat an expert that is not optimal by more.
+
+Both follow from the performance difference lemma: V(expert) - V(policy) is the sum, over the steps
+of the expert's episodes, of the policy's advantages (Eq. 8.6), each of which is at most H, and 0
+where the two agree. It is also minus the sum, over the steps of the policy's episodes, of the
+expert's advantages, each of which is at least -u, and 0 where the two agree.
+
+Policies are fitted to trajectories; in states without data they take the worst action, as the
+theorems allow.
 
 The processes are small enough to be solved exactly, and differ in what one wrong step costs if the
 expert then drives. A policy is an array (H, S): the probability of a wrong action at each step in
@@ -150,8 +165,8 @@ class LossCurve:
         problem: Name of the process.
         learner: The method that fitted the policies.
         horizons: The h horizons [steps].
-        errors: Share of states in which the policy errs, (h, D).
-        gaps: The expert's return minus the policy's, (h, D).
+        errors: Expected share of the steps in which the policy errs (Eq. 8.5), (h, D).
+        gaps: The expert's value V minus the policy's, (h, D).
         bounds: Upper bounds on the gaps by the learner's theorem, (h, D).
     """
 
@@ -207,9 +222,9 @@ def curves(
 def losses_of(process: Process, learner: Learner, policies: F64) -> F64:
     """Return the error and gap of each policy, and the bound of the learner's theorem.
 
-    The error is measured in the states of the expert (cloning, Theorem 8.1) or the policy (DAgger,
-    Theorem 8.2). The gap is the cost of the policy's wrong actions in the states that it visits
-    (the performance difference lemma).
+    The error is measured in the states of the expert (cloning) or of the policy (DAgger). The gap
+    is the cost of the policy's wrong actions in the states that it visits, by the performance
+    difference lemma.
 
     Args:
         process: The process.
@@ -226,9 +241,29 @@ def losses_of(process: Process, learner: Learner, policies: F64) -> F64:
         if learner == "cloning"
         else own
     )
-    factor = horizon if learner == "cloning" else process.recoverability(horizon)
     errors = wrong.sum(axis=(1, 2)) / horizon
-    return np.stack([errors, gaps, factor * horizon * errors])
+    bounds = (
+        cloning_bound(horizon, errors)
+        if learner == "cloning"
+        else dagger_bound(horizon, errors, process.recoverability(horizon))
+    )
+    return np.stack([errors, gaps, bounds])
+
+
+def cloning_bound[T: (float, F64)](horizon: int, error: T) -> T:
+    """Return H^2 eps, Theorem 8.1's bound on the gap, for errors in the expert's episodes."""
+    return horizon**2 * error
+
+
+def dagger_bound[T: (float, F64)](horizon: int, error: T, u: float) -> T:
+    """Return u H eps, the bound on the gap for errors in the policy's own episodes.
+
+    Args:
+        horizon: The horizon H [steps].
+        error: The error eps of each policy.
+        u: Largest cost of one wrong action if the expert then drives.
+    """
+    return u * horizon * error
 
 
 def clone(process: Process, seen: NDArray[np.bool_]) -> F64:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from manip_il.chapter.theory.bounds import DRAWS, ERROR, PROCESSES, LossCurve
-from manip_il.chapter.theory.linear import GUST, OPEN_LOOPS, Drift
+from manip_il.chapter.theory.linear import CHUNK, GUST, REMEDIES, SYSTEMS, Drift
 from manip_il.chapter.theory.shift import WRONG, Shift
 from manip_il.evaluation.intervals import format_percent
 from manip_il.evaluation.report import (
@@ -108,22 +108,28 @@ def _theorems(theory: Theory) -> Section:
         ),
         formulas=(
             (
-                "Theorem 8.1, cloning:  J(π*) - J(π) ≤ H² ε,  ε: share of the expert's states in"
-                " which π errs"
+                "Theorem 8.1, cloning:  |V(π*) - V(π)| ≤ H² ε,  ε: expected share of the H steps"
+                " of the expert's trajectories in which π errs (Eq. 8.5)"
             ),
             (
-                "Theorem 8.2, DAgger:  J(π*) - J(π) ≤ u H ε,  ε: share of π's own states in which"
-                " it errs"
+                "Theorem 8.2, DAgger:  |V(π*) - V(π)| ≤ H ε  after Õ(H²) rounds, with high"
+                " probability,  ε: the error of the fits"
             ),
+            "Measured for DAgger:  V(π*) - V(π) ≤ u H ε,  ε: the same on π's own trajectories",
         ),
         figures=(_theorem_figure(theory.curves),),
         tables=(slope_table(theory),),
         notes=(
             (
                 "Log-log slopes of gap over error. u is the largest cost of one wrong step if the"
-                " expert then drives. Where the bound is stated as H ε, its constant includes u: if"
-                " no recovery is possible, as on the tightrope, u is H, and DAgger loses as much as"
-                " cloning (Ross et al. 2011; Rajaraman et al. 2020)."
+                " expert then drives (Ross et al. 2011). H ε is the case u ≤ 1. If no recovery is"
+                " possible, as on the tightrope, u is H, and DAgger loses as much as cloning"
+                " (Rajaraman et al. 2020). The bound has no absolute value: a policy may beat an"
+                " expert that is not optimal by more."
+            ),
+            (
+                "On the tightrope the fits reach about half of the bound, as they err in all"
+                " steps. A policy that errs in the first step alone reaches it."
             ),
             (
                 f"Points: {DRAWS} fits per horizon, to trajectories that leave about {ERROR:g}/H of"
@@ -157,39 +163,44 @@ def _linear(theory: Theory) -> Section:
         "Continuous control: how an error develops",
         lead=(
             (
-                f"x' = a x + u + w, with disturbances w of {GUST:g}; the expert halves the state in"
-                " every step. Its demonstrations cover few states beside its path, so a clone does"
-                " not correct errors there: they decay if the open loop is stable, as with servos"
-                " that hold joint targets, and otherwise grow by the open loop's factor per step,"
-                " however small the clone's error in the expert's states (in the legend)."
+                f"x' = A x + u + w, with disturbances w of {GUST:g}; the expert halves the state in"
+                " every step. A clone corrects only the deviations that its demonstrations show. If"
+                " it corrects none, an error develops as in the open loop: it decays if that is"
+                " stable. A stable open loop does not make a clone safe: in the coupled system the"
+                " open loop and the expert are stable, but the clone, which has learnt a part of"
+                " the expert's feedback, is not, however small its error in the expert's states"
+                " (in the legend)."
             ),
         ),
         figures=(_linear_figure(theory.drifts),),
         notes=(
             (
-                "Noise on the demonstrations (DART, dashed) makes the expert show corrections, and"
-                " the clone learns them. The exponential growth is proved for smooth deterministic"
-                " imitators (Simchowitz et al. 2025)."
+                "For smooth, deterministic, Markovian imitators such growth cannot be excluded by"
+                " any method that has expert data alone, even if the dynamics are exponentially"
+                " stable, unless the data is sufficiently spread (Simchowitz et al. 2025)."
+            ),
+            (
+                f"Chunks of {CHUNK} actions, executed without feedback, prevent it if the open loop"
+                " is stable; otherwise noise on the demonstrations (DART) makes the expert show"
+                " the missing corrections (Zhang et al. 2025)."
             ),
         ),
     )
 
 
 def _linear_figure(drifts: Sequence[Drift]) -> Figure:
-    """Distance of clones from the expert over the steps."""
-    with drawing(1, size=(5.4, 4.4)) as (drawn, axes):
-        [[axis]] = axes
-        for drift in drifts:
-            label = (
-                f"{OPEN_LOOPS[drift.pole]}, a = {drift.pole:g}{', noisy' if drift.noise else ''}:"
-                f" error {drift.error:.1e}, growth {drift.growth:.2f}"
-            )
-            colour = COLOURS[list(OPEN_LOOPS).index(drift.pole)]
-            steps, line = range(1, len(drift.apart) + 1), "--" if drift.noise else "-"
-            axis.plot(steps, drift.apart, line, color=colour, label=label)
-        axis.axhline(GUST, color=SOFT, ls=":")
-        axis.set(yscale="log", xlabel="step", ylabel="distance from the expert", ylim=_RANGE)
-        drawn.legend(*axis.get_legend_handles_labels(), loc="outside lower center")
+    """Distance of clones from the expert over the steps: one panel per system."""
+    with drawing(len(SYSTEMS), size=(3.2, 3.4)) as (drawn, axes):
+        for drift, axis in zip(drifts, np.repeat(axes[0], len(REMEDIES)), strict=True):
+            label = f"{drift.remedy}: {drift.error:.0e}, {drift.apart[-1]:.0e}"
+            colour = COLOURS[REMEDIES.index(drift.remedy)]
+            axis.plot(range(1, len(drift.apart) + 1), drift.apart, color=colour, label=label)
+            title = f"{drift.system}, largest eigenvalue {drift.radius:.2f}"
+            axis.set(yscale="log", xlabel="step", title=title, ylim=_RANGE)
+        for axis in axes[0]:
+            axis.axhline(GUST, color=SOFT, ls=":")
+            axis.legend(title="remedy: error, last distance")
+        axes[0, 0].set_ylabel("distance from the expert")
         return to_figure(
             drawn,
             "Distance of clones from the expert over the steps, on stable and unstable systems",
@@ -199,16 +210,16 @@ def _linear_figure(drifts: Sequence[Drift]) -> Figure:
 def _arm(shift: Shift) -> list[Section]:
     columns = (
         *("policy", "success", "wrong, expert's states", "wrong, own states"),
-        *("gap [steps]", "bound u H ε [steps]"),
+        *("ε, expert's", "ε, own", "gap [steps]", "H² ε [steps]", "u H ε [steps]"),
     )
     rows = [
         (
             one.name,
             str(one.success),
-            "" if one.on_expert is None else format_percent(one.on_expert),
-            format_percent(one.on_own),
+            *("" if value is None else format_percent(value) for value in one.shares),
+            *("" if value is None else f"{value:.4f}" for value in one.errors),
             f"{one.gap:.1f}",
-            f"{one.bound:,.0f}",
+            *("" if value is None else f"{value:,.0f}" for value in one.bounds),
         )
         for one in shift.rounds
     ]
@@ -219,14 +230,17 @@ def _arm(shift: Shift) -> list[Section]:
             notes=(
                 (
                     "An action is wrong if a joint is off the expert's label by more than"
-                    f" {WRONG:g} of its largest step."
+                    f" {WRONG:g} of its largest step. ε is the number of wrong actions in an"
+                    f" episode divided by H = {shift.env.horizon} (Eq. 8.5): episodes end with"
+                    " success, and no action after it is wrong."
                 ),
                 (
-                    f"Costs are control steps until success, or {shift.env.horizon} without"
-                    f" success; the expert takes {shift.expert_cost:.1f}. u is the largest observed"
-                    f" cost of one wrong action for the expert, {shift.u} steps; the true u may be"
-                    " larger. A bound above the horizon says nothing about this policy: the"
-                    " theorem counts every wrong action as the worst one."
+                    "The reward is 1 in every control step after success, so that V is H less the"
+                    f" control steps until success; the expert takes {shift.expert_cost:.1f}. u is"
+                    " the largest observed cost of one wrong action for the expert,"
+                    f" {shift.u} steps; the true u may be larger. A bound above the horizon says"
+                    " nothing about this policy: the theorem counts every wrong action as the"
+                    " worst one."
                 ),
             ),
         ),

@@ -1,8 +1,9 @@
 """Distribution shift on an arm, measured for every round of a DAgger run.
 
-For each round's policy: how often it errs in the expert's states and in its own, and how much more
-it costs than the expert, compared with Theorem 8.2's bound. Costs are control steps until the task
-is solved, or the horizon if it is not.
+For each round's policy: how often it errs in the expert's states and in its own, and how much less
+its value is than the expert's, compared with the bounds of Theorems 8.1 and 8.2. The reward is 1 in
+every control step after success, so a value V is the horizon H less the cost: the control steps
+until the task is solved, or H if it is not.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.chapter.theory.bounds import cloning_bound, dagger_bound
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
@@ -52,23 +54,22 @@ class RoundShift:
     Attributes:
         round: Number of the round.
         success: Success rate of the policy.
-        on_expert: Share of the expert's states in which the policy is wrong; None for a policy on
-            pictures.
-        on_own: Share of its own states in which the policy is wrong.
-        mistakes: Mean number of wrong actions per episode.
+        shares: Shares of the visited states in which the policy is wrong, in the expert's episodes
+            (None for a policy on pictures) and in its own.
+        errors: The same as `classification_error`, whose divisor is the horizon.
         cost: Mean cost [control steps].
-        gap: Excess of the cost over the expert's [control steps].
-        bound: Theorem 8.2's bound on the gap, u times `mistakes` [control steps].
+        gap: The expert's value minus the policy's [control steps].
+        bounds: Upper bounds on the gap [control steps]: H² eps with the first of `errors`, and u H
+            eps with the second.
     """
 
     round: int
     success: Proportion
-    on_expert: float | None
-    on_own: float
-    mistakes: float
+    shares: tuple[float | None, float]
+    errors: tuple[float | None, float]
     cost: float
     gap: float
-    bound: float
+    bounds: tuple[float | None, float]
 
     @property
     def name(self) -> str:
@@ -77,9 +78,7 @@ class RoundShift:
 
     def to_json(self) -> dict[str, Any]:
         """Return all numbers."""
-        names = ("round", "on_expert", "on_own", "mistakes", "cost", "gap", "bound")
-        success = {"success": self.success.rate, "interval": list(self.success.interval)}
-        return {name: getattr(self, name) for name in names} | success
+        return vars(self) | {"success": self.success.rate, "interval": list(self.success.interval)}
 
 
 @dataclass(frozen=True)
@@ -149,7 +148,7 @@ def measure_shift(
         conditions: The run's variations of the world.
 
     Returns:
-        The rounds' errors in the expert's states and in their own, with costs and bounds.
+        The rounds' errors in the expert's states and in their own, with gaps and bounds.
     """
     seeds, scale = stream_seeds("theory", episodes), described_env(env).actions.scale
     found = list[RoundShift]()
@@ -160,23 +159,25 @@ def measure_shift(
             engine, replace(plain, driver=PolicyDriver.of(path)), seeds, on_episode
         )
         policy = LearnedPolicy.load(path)
-        wrong = _is_wrong(own[schema.EXECUTED_ACTION], own, scale)
-        on_expert = (
-            None
-            if policy.cameras
-            else float(_is_wrong(_actions_on(policy, expert), expert, scale).mean())
-        )
-        mistakes = float(wrong.sum() / episodes)
+        wrong = is_wrong(own[schema.EXECUTED_ACTION], own, scale)
+        share, error = float(wrong.mean()), classification_error(wrong, episodes, env.horizon)
+        on_expert = cloning_error = None
+        if not policy.cameras:
+            wrong = is_wrong(_actions_on(policy, expert), expert, scale)
+            on_expert = float(wrong.mean())
+            cloning_error = classification_error(wrong, episodes, env.horizon)
         found.append(
             RoundShift(
                 round=number,
                 success=success,
-                on_expert=on_expert,
-                on_own=float(wrong.mean()),
-                mistakes=mistakes,
+                shares=(on_expert, share),
+                errors=(cloning_error, error),
                 cost=cost,
                 gap=cost - expert_cost,
-                bound=u * mistakes,
+                bounds=(
+                    None if cloning_error is None else cloning_bound(env.horizon, cloning_error),
+                    dagger_bound(env.horizon, error, u),
+                ),
             )
         )
     return Shift(env, expert_cost, u, tuple(found))
@@ -209,7 +210,26 @@ def _actions_on(policy: LearnedPolicy, table: Columns) -> F64:
     return found
 
 
-def _is_wrong(actions: NDArray[Any], table: Columns, scale: F64) -> NDArray[np.bool_]:
-    """Whether actions (N, n) are wrong, one entry for each frame with a valid label."""
+def is_wrong(actions: NDArray[Any], table: Columns, scale: F64) -> NDArray[np.bool_]:
+    """Return whether actions are wrong, one entry for each frame with a valid label.
+
+    Args:
+        actions: The actions, (N, n).
+        table: The frames' columns, of which the labels and their validity are read.
+        scale: Largest step of each joint, and the gripper's opening, (n,).
+    """
     off = (np.abs(actions - table[schema.ACTION]) / scale).max(axis=1) > WRONG
     return off[table[schema.LABEL_VALID].ravel() != 0]
+
+
+def classification_error(wrong: NDArray[np.bool_], episodes: int, horizon: int) -> float:
+    """Return eps of Eq. 8.5: the mean number of wrong actions per episode over the horizon H.
+
+    Episodes may end before H steps; the steps that they do not take count as right.
+
+    Args:
+        wrong: Whether the action of each step of all episodes is wrong.
+        episodes: Number of episodes.
+        horizon: The horizon H [control steps].
+    """
+    return float(wrong.sum() / (episodes * horizon))
