@@ -22,14 +22,18 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from _machine import describe_machine
+from scipy.special import expit
 
-from manip_il.chapter.preferences.pairs import choose_pairs, find_datasets
+from manip_il.chapter.preferences.pairs import Pairs, choose_pairs, find_datasets, read_clips
 from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.main import main as manip_il
 from manip_il.data import schema
+from manip_il.data.atomic import write_json
 from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset, EpisodeData, Own
 from manip_il.data.lerobot_write import write_episodes
@@ -41,6 +45,7 @@ from manip_il.learn.training_state import PRETRAINED_MODEL
 
 AGREEMENT, AREA, POINTS, P_VALUE = 0.90, 0.95, 0.15, 0.001
 _FRESH, _CLIP, _DRAWS = 2_000, 20, 5
+_POOL = 10  # pairs drawn for each of those that are asked for being doubtful
 _TIE = 0.01  # if the clips' mean progress differs by less, neither is better
 
 
@@ -125,22 +130,40 @@ def learn_reward(rounds: Path, folder: Path, draw: int, count: int) -> Path:
     made = folder / f"draw_{draw}"
     made.mkdir(parents=True, exist_ok=True)
     first, reward = made / "first", made / "reward"
-    files: list[Path] = []
-    for name, by, seed in (("even", "", draw), ("asked", f"--reward={first}", draw + 500)):
-        pairs, answers = made / f"{name}_pairs.json", made / f"{name}.json"
+    chosen, asked = made / "pairs.json", made / "more_pairs.json"
+    for path, number, seed in ((chosen, count, draw), (asked, _POOL * count, draw + 500)):
         manip(
-            f"reward pairs {rounds} --clip={_CLIP} --count={count} {by} --seed={seed}"
-            f" --output={pairs}"
+            f"reward pairs {rounds} --clip={_CLIP} --count={number} --seed={seed} --output={path}"
         )
-        manip(
-            f"reward answer {pairs} --sources={rounds} --teacher=mistaken:0.1 --seed={seed}"
-            f" --output={answers}"
-        )
-        files.append(answers)
-        given = f"{made / 'even_pairs.json'} {' '.join(map(str, files))}"
-        more = f"--more_pairs={pairs}" if by else ""
-        run(f"reward fit {given} {more} --sources={rounds} --seed={draw}", reward if by else first)
+    fit_reward(rounds, chosen, draw, first)
+    both = doubtful(rounds, LearnedReward.load(first / PRETRAINED_MODEL), asked, count)
+    evenly = Pairs.read(chosen)
+    write_json(asked, replace(evenly, pairs=evenly.pairs + both).to_json())
+    fit_reward(rounds, asked, draw, reward)
     return reward
+
+
+def fit_reward(rounds: Path, pairs: Path, seed: int, folder: Path) -> None:
+    """Have the teacher answer pairs, and fit a reward to the answers."""
+    answers = pairs.with_name(f"{pairs.stem}_answers.json")
+    manip(
+        f"reward answer {pairs} --sources={rounds} --teacher=mistaken:0.1 --seed={seed}"
+        f" --output={answers}"
+    )
+    run(f"reward fit {pairs} {answers} --sources={rounds} --seed={seed}", folder)
+
+
+def doubtful(rounds: Path, reward: LearnedReward, path: Path, count: int) -> tuple[Any, ...]:
+    """Return the pairs in a file on which a reward's networks disagree most, by the standard
+    deviation of P(left is better) (Christiano et al. 2017, section 2.2.4).
+    """
+    clips = read_clips(Pairs.read(path), find_datasets([rounds]))
+    inputs, sides = torch.from_numpy(clips.data.inputs), torch.from_numpy(clips.rows)
+    with torch.inference_mode():
+        parts = [reward.network.logits(inputs, part) for part in sides.split(256)]
+    doubt = expit(torch.cat(parts, dim=1).numpy().astype(np.float64)).std(axis=0)
+    kept = np.sort(np.argsort(-doubt, kind="stable")[:count])
+    return tuple(clips.pairs.pairs[place] for place in kept)
 
 
 def clone(folder: Path, name: str, source: object, steps: int, seeds: int) -> EvalResult:

@@ -27,11 +27,11 @@ from manip_il.learn.checkpoint import (
     read_origin,
 )
 from manip_il.learn.network import read_weights, threads
-from manip_il.mdp import F32, F64, I64
+from manip_il.mdp import F32
 from manip_il.worlds.contract import EnvironmentSpec
 
 PREFERENCE = "preference"  # type of a learnt reward in config.json
-_ROWS, _PAIRS = 16_384, 256  # rows and pairs of clips that are evaluated at a time
+_ROWS = 16_384  # rows that are evaluated at a time
 
 
 @dataclass(frozen=True)
@@ -229,19 +229,6 @@ class LearnedReward:
         with threads(1), torch.inference_mode():
             parts = torch.from_numpy(inputs).split(_ROWS)
             return np.concatenate([self.network(part).numpy() for part in parts])
-
-    def logits(self, inputs: F32, sides: I64) -> F64:
-        """Return R(left) - R(right) of A pairs of clips for every network, (M, A).
-
-        Args:
-            inputs: Rows of state, environment state and absolute action, (N, n + k + n).
-            sides: Rows of `inputs` of the left and right clips, (A, 2, L).
-        """
-        frames = torch.from_numpy(inputs)
-        with threads(1), torch.inference_mode():
-            parts = torch.from_numpy(sides).split(_PAIRS)
-            found = torch.cat([self.network.logits(frames, part) for part in parts], dim=1)
-        return found.numpy().astype(np.float64)
 
 
 def write_reward(

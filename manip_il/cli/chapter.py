@@ -30,8 +30,8 @@ class PairsOptions(Seeded, OutputFile):
     """Choose pairs of clips from datasets of one task, for comparison by people (ask) or simulated
     teachers (answer).
 
-    A SOURCE is a dataset or a run; each round of a DAgger run is one source. Without --reward all
-    sources appear equally often. Episodes shorter than --clip are left out.
+    A SOURCE is a dataset or a run; each round of a DAgger run is one source. All sources appear
+    equally often. Episodes shorter than --clip are left out.
 
     Example: manip-il reward pairs runs/dagger --count=200 --output=pairs.json
     """
@@ -39,9 +39,6 @@ class PairsOptions(Seeded, OutputFile):
     sources: list[Path] = option(MISSING, "manip-il datasets, or runs", positional=True)
     clip: int = option(20, "length of a clip [control steps]", at_least=1)
     count: int = option(200, "number of pairs", at_least=1)
-    reward: Path | None = option(
-        None, "a fitted reward, for pairs on which its networks disagree most"
-    )
     output: Path = output_file("pairs.json")
 
 
@@ -83,7 +80,7 @@ class FitOptions(OfPairs, Seeded, Output):
     small networks.
 
     Each pair is held out from one network; fit.json has the agreement on held-out pairs. ANSWERS
-    are files from ask or answer, by one person or several, about PAIRS or --more_pairs.
+    are files from ask or answer, by one person or several, about PAIRS.
     OUTPUT_DIR/pretrained_model holds the reward.
 
     Example: manip-il reward fit pairs.json preferences.json --sources=runs/dagger
@@ -91,7 +88,6 @@ class FitOptions(OfPairs, Seeded, Output):
     """
 
     answers: list[Path] = option(MISSING, "preferences.json from ask or answer", positional=True)
-    more_pairs: list[Path] = option(list, "further pairs.json of the same task and clip length")
     members: int = option(
         8, "number of networks in the ensemble, and of folds of the pairs", at_least=3, at_most=64
     )

@@ -54,7 +54,7 @@ def saved(window: Opened, pairs: Pairs, folder: Path) -> Preferences:
         window.page.click("form button")
     assert download.value.suggested_filename == "preferences.json"
     download.value.save_as(folder / "preferences.json")
-    return Preferences.read(folder / "preferences.json", [pairs])
+    return Preferences.read(folder / "preferences.json", pairs)
 
 
 @pytest.mark.system

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.chapter.preferences.pairs import Pairs
 from manip_il.cli.main import main
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
@@ -46,15 +45,8 @@ def test_a_reward_is_learnt_and_weighs_the_frames_of_a_clone(here, capsys):
     assert run(f"train {words} --output_dir=weighted") == 0
     capsys.readouterr()
     assert (here / "weighted/checkpoints/last/pretrained_model/model.safetensors").is_file()
-    assert run("reward pairs good bad --clip=10 --count=5 --reward=reward --output=more.json") == 0
-    assert Pairs.read(here / "more.json").chosen == "where rewards disagree"
+    assert run("reward pairs good bad --clip=10 --count=5 --output=more.json") == 0
     assert run("reward answer more.json --sources=good,bad --output=c.json") == 0
-    words = (
-        "pairs.json a.json c.json --more_pairs=more.json --sources=good,bad --members=3"
-        " --output_dir=again"
-    )
-    assert run(f"reward fit {words}") == 0
-    assert "45 answers about 45 pairs" in capsys.readouterr().out
     assert (
         run("reward fit pairs.json c.json --sources=good,bad --members=3 --output_dir=third") == 1
     )

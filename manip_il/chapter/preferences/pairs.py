@@ -1,5 +1,4 @@
-"""Pairs of clips to compare, chosen evenly or by disagreement of a reward's networks, and answers
-about them.
+"""Pairs of clips to compare, and answers about them.
 
 Pairs are stored as `pairs.json`, answers as `preferences.json`, by people or by simulated teachers.
 Teachers compare clips by true progress (B-Pref, Lee et al. 2021, section 3):
@@ -16,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +25,6 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from manip_il import checks
-from manip_il.chapter.reward import LearnedReward
 from manip_il.data import schema
 from manip_il.data.build import dataset_sha256
 from manip_il.data.dataset import Dataset, joined_columns
@@ -38,7 +36,6 @@ from manip_il.mdp import F32, F64, I64, require_finite
 from manip_il.worlds.contract import EnvironmentSpec
 from manip_il.worlds.fingerprint import canonical_json
 
-POOL = 10  # candidates per pair when choosing by disagreement
 _TRIES = 100  # attempts to draw a new pair
 FORMAT, VERSION = "manip_il pairs", 1
 _ROUNDS = "round_*/dataset"  # a run's datasets
@@ -240,24 +237,6 @@ class Clips:
         return np.array(begin, np.int64)[:, :, None] + np.arange(self.pairs.clip)
 
 
-def join_pairs(given: Sequence[Pairs]) -> Pairs:
-    """Join the pairs of several files, numbered consecutively.
-
-    Raises `MismatchError` if clip lengths differ.
-    """
-    first = given[0]
-    for other in given:
-        if first.clip != other.clip:
-            raise MismatchError("clip length", "one file", first.clip, "another", other.clip)
-    sources = tuple(dict.fromkeys(source for one in given for source in one.sources))
-
-    def joined(clip: Clip, one: Pairs) -> Clip:
-        return clip._replace(source=sources.index(one.sources[clip.source]))
-
-    pairs = ((joined(a, one), joined(b, one)) for one in given for a, b in one.pairs)
-    return replace(first, sources=sources, pairs=tuple(pairs))
-
-
 def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
     """Return the clips of pairs.
 
@@ -280,18 +259,9 @@ def read_clips(pairs: Pairs, roots: Sequence[Path]) -> Clips:
 
 
 def choose_pairs(
-    roots: Sequence[Path],
-    length: int,
-    count: int,
-    seed: int,
-    rng: np.random.Generator,
-    reward: LearnedReward | None = None,
+    roots: Sequence[Path], length: int, count: int, seed: int, rng: np.random.Generator
 ) -> Clips:
-    """Choose pairs of clips from datasets.
-
-    Episodes shorter than a clip are ignored. With `reward`, `POOL` times as many pairs are drawn,
-    and those are kept on which its networks disagree most, by the standard deviation of P(left is
-    better) (Christiano et al. 2017, section 2.2.4; Lee et al. 2021).
+    """Choose pairs of clips from datasets, evenly. Episodes shorter than a clip are ignored.
 
     Args:
         roots: Folders of the datasets.
@@ -299,20 +269,19 @@ def choose_pairs(
         count: Number of pairs.
         seed: Seed that is stored with the pairs; it draws nothing itself.
         rng: Draws the pairs.
-        reward: The reward whose networks choose among the drawn pairs, if any.
 
     Returns:
         The pairs with the frames of their datasets.
 
     Raises:
-        MismatchError: If datasets and reward do not all have the same task and columns.
+        MismatchError: If the datasets do not all have the same task and columns.
         ManipError: If there are too few different pairs of episodes as long as a clip.
     """
     datasets = [Dataset.open(root) for root in roots]
     data = read_frames(*datasets)
     spec = data.spec
     lengths = np.split(data.lengths, np.cumsum([one.info.episodes for one in datasets])[:-1])
-    drawn = _draw(lengths, length, count * (POOL if reward else 1), rng)
+    drawn = _draw(lengths, length, count, rng)
     if len(drawn) < count:
         raise ManipError(
             f"--count is {count}; only {len(drawn)} pairs of clips of {length} steps were found"
@@ -329,12 +298,7 @@ def choose_pairs(
         pairs=tuple(drawn),
         seed=seed,
     )
-    if reward is not None:
-        reward.check_fits(str(roots[0]), spec)
-        logits = reward.logits(data.inputs, Clips(made, tuple(roots), data).rows)
-        kept = np.sort(np.argsort(-expit(logits).std(axis=0), kind="stable")[:count])
-        pairs = tuple(drawn[place] for place in kept)
-        made = replace(made, pairs=pairs, chosen="where rewards disagree")
+
     return Clips(made, tuple(roots), data)
 
 
@@ -406,21 +370,17 @@ class Preferences:
         return cls(data["pairs"], data["who"], tuple(Answer(**one) for one in data["answers"]))
 
     @classmethod
-    def read(cls, path: Path, pairs: Sequence[Pairs]) -> Preferences:
-        """Return the answers in a file, with pair numbers that count across the pairs of all files,
-        as in `join_pairs`.
+    def read(cls, path: Path, pairs: Pairs) -> Preferences:
+        """Return the answers in a file.
 
         Raises `ManipError` for a file without answers, `MismatchError` for answers about other
         pairs.
         """
         found = read_file(path, PREFERENCES, cls.from_json)
-        known = [one.sha256 for one in pairs]
-        if found.pairs not in known:
+        if found.pairs != pairs.sha256:
             what, given = "sha256 of the pairs", found.pairs[:12]
-            raise MismatchError(what, str(path), given, "the file of pairs", known[0][:12])
-        before = sum(map(len, pairs[: known.index(found.pairs)]))
-        moved = (replace(one, pair=before + one.pair) for one in found.answers)
-        return replace(found, answers=tuple(moved))
+            raise MismatchError(what, str(path), given, "the file of pairs", pairs.sha256[:12])
+        return found
 
 
 @dataclass(frozen=True, eq=False)

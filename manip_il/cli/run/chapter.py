@@ -24,7 +24,6 @@ from manip_il.chapter.preferences.pairs import (
     choose_pairs,
     find_datasets,
     join_answers,
-    join_pairs,
     read_clips,
     read_frames,
 )
@@ -55,10 +54,9 @@ from manip_il.seeding import rng_for, stream_base
 def run_pairs(options: PairsOptions) -> None:
     """Read the sources, choose, and write the pairs."""
     options.check()
-    reward = LearnedReward.load(find_policy(options.reward)) if options.reward else None
     rng = rng_for(stream_base("training", options.seed), "pairs")
     clips = choose_pairs(
-        find_datasets(options.sources), options.clip, options.count, options.seed, rng, reward
+        find_datasets(options.sources), options.clip, options.count, options.seed, rng
     )
     write_json(options.output, clips.pairs.to_json())
     say(f"{len(clips.pairs):,} pairs from {len(clips.pairs.sources)} datasets: {options.output}")
@@ -87,9 +85,9 @@ def run_answer(options: AnswerOptions) -> None:
 
 def run_fit(options: FitOptions) -> None:
     """Fit, measure on held-out pairs, write the reward."""
-    pairs = [Pairs.read(path) for path in (options.pairs, *options.more_pairs)]
+    pairs = Pairs.read(options.pairs)
     answers = join_answers([Preferences.read(path, pairs) for path in options.answers])
-    clips = read_clips(join_pairs(pairs), find_datasets(options.sources))
+    clips = read_clips(pairs, find_datasets(options.sources))
     with progress(None, f"fit {len(answers.better):,} answers") as bar:
         shape = shape_for(clips.data.spec, options.members)
         found = fit_answers(clips, answers, shape, stream_base("training", options.seed), bar.step)
