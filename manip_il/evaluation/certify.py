@@ -28,15 +28,12 @@ from manip_il.evaluation.intervals import CONFIDENCE, Proportion
 from manip_il.evaluation.report import INTERVAL, Table
 from manip_il.mdp import Episode
 from manip_il.seeding import rng_for, stream_seeds
-from manip_il.sim.conditions import Condition
 from manip_il.sim.events import Perturbation, kinds_for
 from manip_il.tasks.table import get_task
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import env_fingerprint, env_spec
 
 FILE_NAME = "certificate.json"
-NOISE = 0.1  # standard deviation of the actions' noise, as a share of their range
-SHARE = 0.3  # share of random actions, where a world has no noise
 # other worlds than ours: kind -> number of random actions in a row
 _RANDOM = {"random": 1, "lost": 20}
 Group = Literal["start", "state", "action"]
@@ -161,7 +158,7 @@ class Certificate:
 
 def count_episodes(env: EnvConfig, cases: int) -> int:
     """Return the largest number of episodes that `certify` runs."""
-    return cases * (2 + len(_kinds(env)))
+    return cases * (1 + len(_kinds(env)))
 
 
 class _Kind(NamedTuple):
@@ -199,15 +196,6 @@ def _perturbed(kind: str, env: EnvConfig, moments: Mapping[int, int]) -> Rollout
     return RolloutJob(env, hold=0, conditions=(Perturbation(kind, moments),))
 
 
-def _noisy(env: EnvConfig) -> tuple[str, RolloutJob]:
-    """Return the job of the expert with noise, and the noise in words."""
-    if "varied" in env_spec(env).can:
-        noise = Condition("noise", action_noise=(NOISE, NOISE))
-        job = RolloutJob(env, hold=0, conditions=(noise,))
-        return f"{100 * NOISE:.0f} % noise on every action", job
-    job = RolloutJob(env, DisturbedDriver(SHARE), hold=0)
-    return f"{100 * SHARE:.0f} % of the actions random", job
-
 
 def certify(
     engine: Engine,
@@ -229,8 +217,7 @@ def certify(
         on_episode: Called with every episode as it ends.
 
     Returns:
-        The certificate, with one row per kind of perturbation, one for undisturbed episodes and one
-        for noise on every action.
+        The certificate, with one row per kind of perturbation and one for undisturbed episodes.
 
     Raises:
         ManipError: if the expert solves none of the undisturbed episodes.
@@ -266,9 +253,6 @@ def certify(
             if _differ(episode, plain[episode.seed], moment := moments[episode.seed])
         ]
         add(known.group, kind, known.words, found)
-    words, job = _noisy(env)
-    noisy = (_case(episode, 0, env.horizon) for episode in rollouts(job))
-    add("start", "noise", words, noisy)
     names = ("horizon", "control_hz", "tolerance", "success_steps")
     settings = {"cases": cases, "seed": seed} | {name: getattr(env, name) for name in names}
     spec = env_spec(env)
