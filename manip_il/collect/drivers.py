@@ -107,12 +107,10 @@ class DisturbedDriver(Driver):
     """Executes the expert's label, except where a random action replaces it.
 
     Attributes:
-        share: Share of the control steps at which that happens.
-        moments: A control step from which it happens, too, by seed.
+        moments: A control step from which that happens, by seed.
         steps: Number of control steps for which it then happens.
     """
 
-    share: float = 0.0
     moments: Mapping[int, int] = field(default_factory=dict[int, int])
     steps: int = 1
     kind = "disturbed"
@@ -125,7 +123,7 @@ class DisturbedDriver(Driver):
         def act(turn: Turn) -> tuple[F64, Actor]:
             rng = rng_for(turn.seed, "disturbed", turn.step)
             since = turn.step - self.moments.get(turn.seed, turn.step + 1)
-            if rng.uniform() < self.share or 0 <= since < self.steps:
+            if 0 <= since < self.steps:
                 return draw(turn.observation.state, rng), Actor.NOISY_EXPERT
             return turn.query().action, Actor.EXPERT
 
