@@ -12,7 +12,7 @@ and the checks. The guarantees, and the tests in `tests/store` for them:
 - Nothing is written outside the target folder:
   `test_a_hostile_manifest_is_refused_and_nothing_is_written`, `test_whatever_a_manifest_holds_...`.
 - Nothing of others is replaced or deleted:
-  `test_a_push_removes_what_the_manifest_before_lists_...`,
+  `test_a_push_removes_nothing_from_a_store`,
   `test_what_others_keep_in_a_repository_stays_...`.
 - No more arrives than the remote lists: `test_a_file_that_is_larger_than_the_list_says_...`,
   `test_an_answer_without_an_end_...`.

@@ -94,14 +94,12 @@ class Manifest:
         files: Path -> file.
         version: The version's id on the remote.
         copies: Paths at the root that repeat the files of a run's policy; they are not pulled.
-        replaced: Hashes of objects that only the version before names.
     """
 
     kind: Kind
     files: Mapping[str, File]
     version: str = ""
     copies: frozenset[str] = frozenset()
-    replaced: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         """Raise `RemoteError` as `check_path` does."""
@@ -114,8 +112,7 @@ class Manifest:
             {"path": path, "size": one.size, "sha256": one.sha256}
             for path, one in sorted(self.files.items())
         ]
-        table = {"version": 1, "kind": self.kind, "files": files, "replaced": sorted(self.replaced)}
-        return json.dumps(table, indent=1).encode()
+        return json.dumps({"version": 1, "kind": self.kind, "files": files}, indent=1).encode()
 
     @classmethod
     def from_json(cls, data: bytes, version: str) -> Manifest:
@@ -127,8 +124,7 @@ class Manifest:
                     "the manifest was written by another version of manip-il; use a newer one"
                 )
             files = {one["path"]: File(one["size"], one["sha256"]) for one in table["files"]}
-            replaced = frozenset(File(0, sha256).sha256 for sha256 in table.get("replaced", ()))
-            return cls(table["kind"], files, version, replaced=replaced)
+            return cls(table["kind"], files, version)
         except (LookupError, TypeError, AttributeError) as error:
             raise RemoteError("the manifest is invalid; push again, to an empty folder") from error
 

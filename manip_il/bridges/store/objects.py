@@ -4,8 +4,8 @@ manifest.
     PLACE/manip_il_manifest.json       replaced last, atomically: readers see one version
          /objects/3f/3f9a...           each file's bytes, never changed
 
-Objects of the previous version stay until the next push, so that its readers can finish: the
-manifest lists them, and nothing else is ever removed.
+Nothing is ever removed, so that readers of older versions can finish, and a push that comes back
+to older files sends nothing.
 """
 
 import hashlib
@@ -13,8 +13,6 @@ import logging
 import re
 import secrets
 import tempfile
-from contextlib import suppress
-from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, override
@@ -206,7 +204,7 @@ class Objects:
             return Manifest.from_json(data, info.get("ETag") or hashlib.sha256(data).hexdigest())
 
     def write(self, plan: PushPlan) -> None:
-        """Upload missing objects, then replace the manifest and remove unused objects."""
+        """Upload missing objects, then replace the manifest."""
         with explained(f"push to {self.name}"):
             found = self._fs.find(f"{self._root}/objects", detail=True)
             if links := [
@@ -235,16 +233,7 @@ class Objects:
                     )
             before = plan.before or Manifest(plan.manifest.kind, {})
             if files != before.files:
-                old, new = (
-                    {file.sha256 for file in version.values()} for version in (before.files, files)
-                )
-                unused = (before.replaced & there.keys()) - old - new
-                self._switch(
-                    replace(plan.manifest, replaced=frozenset(old - new | unused)), before.version
-                )
-                with suppress(FileNotFoundError):  # another push removes them, too
-                    if unused:
-                        self._fs.rm([self._object(key) for key in unused])
+                self._switch(plan.manifest, before.version)
 
     def download(self, manifest: Manifest, folder: Path, path: str) -> None:
         """Download the object of one file, without checking its hash.
