@@ -35,7 +35,7 @@ from manip_il.evaluation.results import (
 from manip_il.evaluation.side import Side
 from manip_il.evaluation.suites import suite_conditions
 from manip_il.learn.checkpoint import Checkpoint
-from manip_il.mdp import F64, Episode, State
+from manip_il.mdp import Episode
 from manip_il.option import NameOrPath, make_options
 from manip_il.progress import Progress
 from manip_il.seeding import BLOCK, stream_seeds
@@ -44,7 +44,7 @@ from manip_il.sim.config import CameraConfig
 from manip_il.sim.world import World
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.several import task_number
-from manip_il.worlds.table import described_env, env_fingerprint, env_of_name, env_spec, task_names
+from manip_il.worlds.table import env_fingerprint, env_of_name, env_spec, task_names
 
 CHECK_EVERY = 100  # number of episodes between checks of the interval's width
 EPISODES_FILE = "episodes.jsonl"
@@ -131,7 +131,6 @@ def episode_hold(env: EnvConfig, hold: int | None = HOLD) -> int | None:
 def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     """Return the result of an episode."""
     solved = np.flatnonzero(episode.columns[schema.SUCCESS])
-    states = episode.columns[schema.SIM_STATE]
     phase = int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])
     if phase == 0 and episode.success_at_end:  # the expert is not queried in a solved state
         phase = -1
@@ -149,26 +148,8 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
             "steps_to_success": int(solved[0]) + 1 if solved.size else None,
             "condition": turn_of(job.conditions, episode.seed).name,
             "drawn": draw(job.conditions, episode.seed, job.env.object),
-            "start": positions(job.env, states[0]),
-            "end": positions(job.env, states[-1]),
         },
     )
-
-
-def positions(env: EnvConfig, sim_state: F64) -> dict[str, list[float]]:
-    """Return the true positions [m] of the hand and the objects in one row of `sim_state` (m,):
-    name -> [x, y, z].
-
-    The hand is named `hand`. The first object that the arm must reach is named `object`.
-    Empty if the environment cannot be restored.
-    """
-    world = described_env(env)
-    if "restored" not in world.spec.can:
-        return {}
-    world.set_state(State.from_vector(sim_state))
-    return {
-        name: [round(float(value), 4) for value in at] for name, at in world.positions().items()
-    }
 
 
 def finished_episodes(folder: Path, job: RolloutJob, suite: str) -> dict[int, EpisodeResult]:

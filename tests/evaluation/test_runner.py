@@ -62,7 +62,7 @@ def test_outcomes_depend_on_no_batch_and_no_worker(kind, request):
     job = replace(job_of(policy, conditions=ALL), env=replace(ENV, horizon=20))
     seeds = stream_seeds("test", 28)
     expected = evaluate(Engine(1), replace(job, batch=1), seeds, "it")
-    assert len({episode.detail["end"]["hand"][0] for episode in expected.episodes}) > 20
+    assert len({episode.ret for episode in expected.episodes}) > 20
     with Engine(2) as two:
         for batch in (8, 25):
             for engine in (Engine(1), two):
@@ -77,7 +77,7 @@ def test_an_episode_of_a_suite_is_that_of_its_condition_alone(act):
         for one in evaluate(Engine(1), job_of(act, conditions=ALL), SEEDS, "it").episodes
     }
     nominal = {one.seed: one for one in evaluate(Engine(1), job_of(act), SEEDS, "it").episodes}
-    same = [seed for seed in SEEDS if together[seed].detail["end"] == nominal[seed].detail["end"]]
+    same = [seed for seed in SEEDS if together[seed].ret == nominal[seed].ret]
     assert same == [seed for seed in SEEDS if turn_of(ALL, seed) == NOMINAL]
     assert len(same) == 3
 

@@ -13,7 +13,7 @@ import pytest
 from manip_il.collect.drivers import ExpertDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.evaluation.measuring import episode_hold, positions
+from manip_il.evaluation.measuring import episode_hold
 from manip_il.learn.action_spaces import conversion_for
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
@@ -188,7 +188,7 @@ def test_positions_are_those_of_the_observation(task: str):
     row = dict(
         zip(env.spec.environment_state_names, env.observe().environment_state.tolist(), strict=True)
     )
-    found = positions(config(task), env.get_state().to_vector())
+    found = env.positions()
     first = next(iter(env.world.about.objects))
     for name, observed in {"hand": "right_ee", "object": first}.items():
         assert found[name] == pytest.approx([row[f"{observed}.{axis}"] for axis in "xyz"], abs=1e-4)

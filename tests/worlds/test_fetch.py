@@ -9,7 +9,6 @@ import pytest
 from manip_il.collect.drivers import Driver, ExpertDriver, NoisyExpertDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.errors import MismatchError
-from manip_il.evaluation.measuring import positions
 from manip_il.evaluation.world_check import check_world
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import lerobot_options
@@ -103,7 +102,7 @@ def test_positions_are_those_of_the_observation(task: str):
     row = dict(
         zip(env.spec.environment_state_names, env.observe().environment_state.tolist(), strict=True)
     )
-    found = positions(config(task), env.get_state().to_vector())
+    found = env.positions()
     names = {"hand": "ee"} | ({"object": "object"} if task != "FetchReach-v4" else {})
     assert found.keys() == names.keys()
     for name, observed in names.items():
