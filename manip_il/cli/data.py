@@ -99,8 +99,7 @@ class RelabelOptions(Edit):
     """Relabel every state of a dataset with the current expert, instead of recording again.
 
     TARGET is SOURCE with new labels; executed actions, pictures and all other columns stay the
-    same. States in which the expert was not queried get a label, too. Prints how many labels
-    changed: by more than 1 % of a joint's longest step, in phase, or in validity.
+    same. States in which the expert was not queried get a label, too.
 
     Example: manip-il data relabel datasets/demos
     """
@@ -175,8 +174,7 @@ class ScoreOptions(OfDataset, Output):
     """Score every frame and episode of a dataset by a reward, and list the worst episodes.
 
     Writes scores.json, and rabc.parquet with the frames' weights for manip-il train --weights= and
-    lerobot-train --sample_weighting.progress_path=. If the dataset says which episodes failed, also
-    prints how well the score detects them.
+    lerobot-train --sample_weighting.progress_path=.
 
     Example: manip-il data score datasets/demos --reward=runs/reward --output_dir=runs/scores
     """
