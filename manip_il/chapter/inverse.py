@@ -42,10 +42,6 @@ _TASTES = 20  # random weight vectors whose paths show whether a feature matters
 CARRY = "carry"
 _MOVED = 0.004  # distance from the start beyond which an object counts as moving [m]
 FILE_NAME = "reward.json"
-_PINNED = (
-    "maximum entropy left weights at their lower bounds, so ratios of weights may be wrong: {};"
-    " compare with --method=bayesian"
-)
 
 
 def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> list[Demonstration]:
@@ -106,7 +102,6 @@ class Learnt:
         open: Indices of the weights that are not identified, see `open_features`.
         intervals: The weights' credible intervals, (K, 2), or None.
         gap: Duality gap of `max_margin`, relative to its objective, or None.
-        pinned: Indices of the weights that `max_entropy` left at their lower bounds.
     """
 
     method: str
@@ -114,7 +109,6 @@ class Learnt:
     open: tuple[int, ...] = ()
     intervals: F64 | None = None
     gap: float | None = None
-    pinned: tuple[int, ...] = ()
 
 
 def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.Generator) -> Learnt:
@@ -142,9 +136,12 @@ def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.G
     else:
         weights = max_entropy.fit(demonstrations)
         pinned = [k for k in max_entropy.pinned(demonstrations, weights) if k not in unknown]
-        more["pinned"] = tuple(pinned)
         if pinned:
-            warn(_PINNED.format(", ".join(f"{FEATURES[k]} ({weights[k]:.0f} / m)" for k in pinned)))
+            names = ", ".join(f"{FEATURES[k]} ({weights[k]:.0f} / m)" for k in pinned)
+            warn(
+                f"maximum entropy left weights at their lower bounds: {names}; their ratios may be"
+                " wrong, so compare with --method=bayesian"
+            )
     weights = weights / weights[LENGTH]
     weights[unknown] = 0.0
     return Learnt(method, weights, tuple(unknown), **more)
@@ -206,8 +203,6 @@ class Inverse:
             "demonstrations": len(self.demonstrations),
             "source": self.source,
             "excess": self.excess,
-            "duality_gap": self.learnt.gap,
-            "at_lower_bound": [FEATURES[k] for k in self.learnt.pinned],
         }
 
 
@@ -237,8 +232,6 @@ def inverse_report(found: Inverse) -> Report:
             f"No demonstration differs from its alternatives in {names}, so these weights are"
             " not identified. The reward omits them, and plans with 0 instead."
         )
-    if found.learnt.pinned:
-        notes.append(_PINNED.format(", ".join(FEATURES[k] for k in found.learnt.pinned)))
     weights = Section("What a metre costs", tables=(weight_table(found),), notes=tuple(notes))
     return Report(
         title="Costs inferred from demonstrations",
