@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from manip_il.errors import UsageError
 from manip_il.option import Seeded, check_bounds, option
 from manip_il.worlds.config import EnvConfig
 
@@ -63,6 +64,9 @@ class DiscriminatorConfig:
         256, "transitions of the expert per gradient step, and as many of the learner", at_least=1
     )
     penalty: float = option(1.0, "weight of the gradient penalty; 0: none", at_least=0)
+    state_only: bool = option(
+        False, "rl airl: a reward of the state alone, which is written to OUTPUT_DIR/reward"
+    )
 
     def __post_init__(self) -> None:
         check_bounds(self, "discriminator.")
@@ -120,6 +124,11 @@ class LearningConfig(Seeded):
 
     def __post_init__(self) -> None:
         check_bounds(self)
+        if self.discriminator.state_only and self.method != "airl":
+            raise UsageError(
+                f"discriminator.state_only is true for {self.method}; expected false, as only AIRL"
+                " learns a reward"
+            )
 
     @property
     def discount(self) -> float:

@@ -9,13 +9,15 @@ Both learn D = P(expert | transition) by logistic loss. GAIL's is any function o
 
 so that at the optimum g is a reward up to shaping (Fu, Luo & Levine, Learning robust rewards with
 adversarial inverse reinforcement learning, ICLR 2018, equations 4 and 7). The reward of both is log
-D - log(1 - D); AIRL's is f - log pi.
+D - log(1 - D); AIRL's is f - log pi. A g of the state alone does not depend on how an arm moves
+(section 5), and can be kept as a reward.
 
 Here, AIRL's pi is divided by exp(-H), where H is its entropy. Otherwise -log pi, whose mean is H,
 would reward every step before the absorbing state but none in it, as no action is sampled there,
 and f would have to follow every change of H.
 """
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,6 +27,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 
 from manip_il.chapter.config import DiscriminatorConfig
 from manip_il.chapter.episodes import Transitions
+from manip_il.chapter.reward import RewardNetwork, RewardShape
 from manip_il.learn.network import MLPNetwork, perceptron
 from manip_il.mdp import F32
 
@@ -52,7 +55,14 @@ class Discriminator(nn.Module):
         self._normalise = network.encode
         self.register_buffer("free", (network.target_scale > 0).float())
         encoded = len(network.input_mean) + 1
-        self.g = perceptron(encoded + len(self.free), config.width, 2, 1, nn.ReLU)
+        if not config.state_only:
+            self.g = perceptron(encoded + len(self.free), config.width, 2, 1, nn.ReLU)
+        else:
+            columns = network.numbers + len(self.free)
+            unread = tuple(range(network.numbers, columns))
+            self.g = RewardNetwork(columns, RewardShape(1, config.width, unread=unread))
+            self.g.initialise(torch.default_generator)
+            self.absorbing_g = nn.Parameter(torch.zeros(()))  # the inputs there are all 0
         self.h = None if gamma is None else perceptron(encoded, config.width, 2, 1, nn.ReLU)
         self._gamma = gamma or 0.0
         self.optimizer = torch.optim.Adam(self.parameters(), lr=config.lr, fused=True)
@@ -60,10 +70,30 @@ class Discriminator(nn.Module):
     def logits(self, batch: Batch) -> Tensor:
         """Return log D - log(1 - D), (B,)."""
         states, actions, next_states, log_prob = batch
-        g = self.g(torch.cat([states, actions], dim=1))
+        if isinstance(self.g, RewardNetwork):
+            g = self.g.members(states)[0, :, None] + self.absorbing_g * states[:, -1:]
+        else:
+            g = self.g(torch.cat([states, actions], dim=1))
         if self.h is None:
             return g.squeeze(1)
         return (g + self._gamma * self.h(next_states) - self.h(states) - log_prob).squeeze(1)
+
+    @torch.no_grad()
+    def learned(self, network: MLPNetwork, states: F32) -> RewardNetwork:
+        """Return a g of the state alone as a reward of raw inputs and actions, which it ignores.
+
+        Args:
+            network: The actor.
+            states: Raw inputs and the flag of the absorbing state, (N, d + 1), of which those that
+                are not absorbing set the reward's range.
+        """
+        assert isinstance(self.g, RewardNetwork)
+        made = copy.deepcopy(self.g)
+        made.mean.copy_(network.input_mean[: len(made.mean)])
+        made.std.copy_(1 / network.input_scale[: len(made.std)])
+        [rewards] = made.members(torch.from_numpy(states[states[:, -1] == 0]))
+        made.set_range(rewards)
+        return made
 
     def reward(self, learner: Transitions, log_probs: F32) -> F32:
         """Return the reward of every transition, (N,), clipped to +-10.

@@ -18,7 +18,7 @@ from manip_il.chapter.rewards import bayesian, max_entropy, max_margin
 from manip_il.data import schema
 from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, warn
 from manip_il.evaluation.report import Report, Section, Table
 from manip_il.mdp import F64
 from manip_il.robots.table import get_robot
@@ -101,12 +101,14 @@ class Learnt:
             are 0.
         open: Indices of the weights that are not identified, see `open_features`.
         intervals: The weights' credible intervals, (K, 2), or None.
+        gap: Duality gap of `max_margin`, relative to its objective, or None.
     """
 
     method: str
     weights: F64
     open: tuple[int, ...] = ()
     intervals: F64 | None = None
+    gap: float | None = None
 
 
 def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.Generator) -> Learnt:
@@ -119,20 +121,30 @@ def learn(method: str, demonstrations: Sequence[Demonstration], rng: np.random.G
             `bayesian`.
 
     Returns:
-        The weights, with credible intervals if the method is `bayesian`.
+        The weights, with credible intervals if the method is `bayesian`. A warning names weights
+        that `max_entropy` left at their lower bounds.
     """
     tastes = rng.exponential(bayesian.PRIOR, (_TASTES, demonstrations[0].problem.features.shape[1]))
     unknown = open_features(demonstrations, rivals(demonstrations, tastes))
-    intervals = None
+    more = dict[str, Any]()
     if method == "bayesian":
         draws = bayesian.fit(demonstrations, rng)
         weights, ratios = draws.mean(axis=0), draws / draws[:, [LENGTH]]
-        intervals = np.quantile(ratios, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0).T
+        more["intervals"] = np.quantile(ratios, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0).T
+    elif method == "max_margin":
+        weights, more["gap"] = max_margin.fit(demonstrations)
     else:
-        weights = (max_margin if method == "max_margin" else max_entropy).fit(demonstrations)
+        weights = max_entropy.fit(demonstrations)
+        pinned = [k for k in max_entropy.pinned(demonstrations, weights) if k not in unknown]
+        if pinned:
+            names = ", ".join(f"{FEATURES[k]} ({weights[k]:.0f} / m)" for k in pinned)
+            warn(
+                f"maximum entropy left weights at their lower bounds: {names}; their ratios may be"
+                " wrong, so compare with --method=bayesian"
+            )
     weights = weights / weights[LENGTH]
     weights[unknown] = 0.0
-    return Learnt(method, weights, tuple(unknown), intervals)
+    return Learnt(method, weights, tuple(unknown), **more)
 
 
 @dataclass(frozen=True)
@@ -153,6 +165,12 @@ class Inverse:
     def open_names(self) -> tuple[str, ...]:
         """Features whose weights the demonstrations do not determine."""
         return tuple(FEATURES[k] for k in self.learnt.open)
+
+    @property
+    def facts(self) -> tuple[str, ...]:
+        """How far weights of maximum margin are from optimal; empty for other methods."""
+        gap = self.learnt.gap
+        return () if gap is None else (f"duality gap: {gap:.1e} of the objective",)
 
     @cached_property
     def means(self) -> tuple[F64, F64]:
@@ -208,15 +226,13 @@ def weight_table(found: Inverse) -> Table:
 
 def inverse_report(found: Inverse) -> Report:
     """Return the report of the learnt weights."""
-    names, notes = ", ".join(found.open_names), ()
+    names, notes = ", ".join(found.open_names), list(found.facts)
     if names:
-        notes = (
-            (
-                f"No demonstration differs from its alternatives in {names}, so these weights are"
-                " not identified. The reward omits them, and plans with 0 instead."
-            ),
+        notes.append(
+            f"No demonstration differs from its alternatives in {names}, so these weights are"
+            " not identified. The reward omits them, and plans with 0 instead."
         )
-    weights = Section("What a metre costs", tables=(weight_table(found),), notes=notes)
+    weights = Section("What a metre costs", tables=(weight_table(found),), notes=tuple(notes))
     return Report(
         title="Costs inferred from demonstrations",
         verdict=(

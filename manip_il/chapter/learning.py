@@ -6,6 +6,7 @@ Each iteration runs whole episodes, with its own seeds and random streams.
     validation/          every validated policy and its eval.json, by iteration
     metrics.jsonl        a line per iteration
     best/                the policy with the highest validation success; on a tie the latest
+    reward/              AIRL's reward after the last iteration, if of the state alone
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from manip_il.chapter.ppo import (
     start_conversion,
     start_policy,
 )
-from manip_il.chapter.reward import LearnedReward
+from manip_il.chapter.reward import LearnedReward, write_reward
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import HOLD, RolloutJob
 from manip_il.data.atomic import new_folder
@@ -72,6 +73,9 @@ def imitate(run: LearningRun, c: LearningConfig) -> Iterator[Result]:
         agent.rollouts()
         agent.improve(agent.discriminate(d))
         yield run.finish(agent)
+    if c.discriminator.state_only:
+        with new_folder(run.folder / "reward") as new:
+            agent.save_reward(d, new / PRETRAINED_MODEL)
 
 
 def ppo(
@@ -261,6 +265,16 @@ class Agent:
             rewards = d.reward(self._rows, own)
         self.metrics |= {f"discriminator_{name}": value for name, value in found.items()}
         return rewards
+
+    def save_reward(self, d: Discriminator, folder: Path) -> None:
+        """Write the reward that AIRL's discriminator holds to a `pretrained_model` folder."""
+        assert self._expert is not None
+        found = d.learned(
+            self._policy.model, np.concatenate([self._expert.states, self._rows.states])
+        )
+        folder.mkdir()
+        fingerprint = env_fingerprint(self.config.env)
+        write_reward(folder, found, self._spec, self._options(), fingerprint)
 
     def improve(self, rewards: F32) -> None:
         """Update the policy by PPO with the rewards (N,) of the last rollouts."""

@@ -1,4 +1,4 @@
-"""A reward learnt from preferences: an ensemble of networks, and the folder that holds it."""
+"""A learnt reward, from preferences or by AIRL: its networks, and the folder that holds it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ from manip_il.learn.network import read_weights, threads
 from manip_il.mdp import F32
 from manip_il.worlds.contract import EnvironmentSpec
 
-PREFERENCE = "preference"  # type of a learnt reward in config.json
+PREFERENCE = "preference"  # type of a learnt reward in config.json, AIRL's included
+_RANGE = (0.01, 0.99)  # quantiles of the frames' rewards that become 0 and 1
+_MOST_FRAMES = 100_000  # of which about as many are enough for the quantiles
 _ROWS = 16_384  # rows that are evaluated at a time
 
 
@@ -141,6 +143,13 @@ class RewardNetwork(nn.Module):
                 spread = math.sqrt(2 / weight.shape[1]) * (0.01 if last else 1.0)
                 weight.copy_(spread * torch.randn(weight.shape, generator=generator))
 
+    def set_range(self, rewards: Tensor) -> None:
+        """Let `forward` map a low and a high quantile of mean rewards (N,) to 0 and 1."""
+        some = rewards[:: max(1, len(rewards) // _MOST_FRAMES)]
+        low, high = torch.quantile(some, torch.tensor(_RANGE)).tolist()
+        self.low.fill_(low)
+        self.high.fill_(max(high, low + 1e-6))
+
     def features(self, inputs: Tensor) -> Tensor:
         """Return the used columns of the inputs (B, d), then the log-lengths of the K offsets,
         (B, up to d + K).
@@ -182,7 +191,7 @@ class RewardNetwork(nn.Module):
 
 
 class LearnedReward:
-    """A reward learnt from preferences.
+    """A reward learnt from preferences or by AIRL.
 
     It is about 0 for the worst and 1 for the best of the states that it was trained on.
 
@@ -196,7 +205,7 @@ class LearnedReward:
 
     @classmethod
     def load(cls, path: Path) -> LearnedReward:
-        """Load a folder written by `manip-il reward fit`, only from JSON and safetensors.
+        """Load a folder that `write_reward` wrote, only from JSON and safetensors.
 
         Raises `ManipError` for a folder that is incomplete or holds something else.
         """

@@ -165,8 +165,9 @@ class GailOptions(Learning):
 class AirlOptions(GailOptions):
     """Imitate demonstrations by adversarial inverse reinforcement learning (AIRL).
 
-    Like `manip-il rl gail`, with the discriminator exp f / (exp f + pi): f is a learnt reward, pi
-    the policy's density.
+    Like `manip-il rl gail`, with the discriminator exp f / (exp f + pi): f is a learnt reward and
+    its shaping, pi the policy's density. With --discriminator.state_only=true, OUTPUT_DIR/reward
+    holds the reward after the last iteration, for `manip-il data score` and `rl ppo`.
 
     Example: manip-il rl airl --dataset.root=datasets/demos --init=runs/cloned
     --output_dir=runs/airl
@@ -178,7 +179,7 @@ class AirlOptions(GailOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class PpoOptions(Learning):
-    """Improve a cloned policy (--init) by PPO with a reward learnt from preferences.
+    """Improve a cloned policy (--init) by PPO with a learnt reward, from preferences or AIRL.
 
     Episodes continue after success, because the reward scores every state. OUTPUT_DIR/best holds
     the policy with the highest validation success, which may be the initial one.
@@ -188,5 +189,5 @@ class PpoOptions(Learning):
 
     method: ClassVar[str] = "ppo"
     init: Path = option(MISSING, "the cloned mlp (a checkpoint or a run) to improve")
-    reward: Path = option(MISSING, "the reward: a folder from manip-il reward fit")
+    reward: Path = option(MISSING, "the reward: a folder from manip-il reward fit or rl airl")
     output_dir: Path = output_folder("runs/ppo")

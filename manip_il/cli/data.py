@@ -180,6 +180,6 @@ class ScoreOptions(OfDataset, Output):
     """
 
     reward: str = option(
-        MISSING, "a folder from manip-il reward fit, or progress for the true progress"
+        MISSING, "a folder from manip-il reward fit or rl airl, or progress for the true progress"
     )
     output_dir: Path = output_folder("runs/scores")

@@ -70,6 +70,20 @@ def test_the_reward_of_airl_is_f_less_the_log_density():
     np.testing.assert_allclose(d.reward(steps, logs), expected, rtol=1e-5, atol=1e-5)
 
 
+def test_the_reward_that_airl_keeps_is_g_of_raw_inputs():
+    d: Any = trained("airl", state_only=True)[0]
+    steps, actor = rows(0.0, seed=3), network()
+    kept = d.learned(actor, steps.states)
+    with torch.no_grad():
+        [g] = d.g.members(d._encode(steps, np.zeros(N, np.float32))[0])
+        [r] = kept.members(torch.from_numpy(steps.states[:, :-1]))
+        scaled = kept(torch.from_numpy(steps.states[:, :-1]))
+    assert torch.equal(g, r)
+    assert torch.quantile(scaled, torch.tensor([0.01, 0.99])).tolist() == pytest.approx(
+        [0, 1], abs=1e-4
+    )
+
+
 def test_the_penalty_holds_the_slope_near_one():
     slopes = []
     for penalty in (0.0, 10.0):

@@ -10,9 +10,11 @@ import pytest
 from manip_il.algorithms.results import Result, best_validation, validations
 from manip_il.chapter.config import DiscriminatorConfig, LearningConfig, PPOConfig
 from manip_il.chapter.learning import LearningRun, ppo
+from manip_il.chapter.reward import LearnedReward
 from manip_il.cli.main import main
 from manip_il.collect.workers import Engine
 from manip_il.errors import FolderExistsError
+from manip_il.learn.checkpoint import find_policy
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.worlds.table import env_spec, make_config
 
@@ -103,6 +105,24 @@ def test_until_the_warm_up_is_over_a_clone_acts_as_it_did(config, cloned, tmp_pa
     assert np.array_equal(before, warm)
     assert not np.array_equal(before, moved)
     assert list(validations(tmp_path / "warm")) == [0, 1, 2], "0 is the clone itself"
+
+
+def test_a_policy_learns_from_the_reward_that_airl_kept(config, cloned, tmp_path):
+    discriminator = replace(config.discriminator, state_only=True)
+    airl = replace(config, method="airl", steps=100, discriminator=discriminator)
+    run(airl, tmp_path / "airl")
+    reward = LearnedReward.load(find_policy(tmp_path / "airl" / "reward"))
+    spec = env_spec(ENV)
+    reward.check_fits("the environment", spec)
+    rows = np.random.default_rng(0).normal(size=(50, 16 + len(spec.environment_state_names)))
+    inputs = rows.astype(np.float32)
+    others = inputs.copy()
+    others[:, -8:] = 0
+    assert np.array_equal(reward(inputs), reward(others)), "it is a function of the state"
+    assert np.ptp(reward(inputs)) > 0
+    words = ["--steps=40", "--episodes=4", "--episode_steps=10", "--validation_episodes=1"]
+    found = [f"--reward={tmp_path / 'airl' / 'reward'}", f"--init={cloned}"]
+    assert main(["rl", "ppo", *words, *found, f"--output_dir={tmp_path / 'ppo'}", "--quiet"]) == 0
 
 
 def test_a_reward_that_is_given_sees_steps_as_datasets_have_them(config, cloned, tmp_path):

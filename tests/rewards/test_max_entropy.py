@@ -5,8 +5,9 @@ features.
 import numpy as np
 import pytest
 
-from manip_il.chapter.rewards.max_entropy import fit, loss_of, soft_plan
-from manip_il.tasks.carry.grid import Demonstration
+from manip_il.chapter.inverse import learn
+from manip_il.chapter.rewards.max_entropy import fit, least_weights, loss_of, soft_plan
+from manip_il.tasks.carry.grid import LENGTH, Demonstration
 from tests.rewards.grids import draw, grid
 
 WEIGHTS = np.array([3.5, 2.0, 5.0])
@@ -40,3 +41,22 @@ def test_the_gradient_is_that_of_central_differences(prior):
 
 def test_weights_are_those_that_drew_the_demonstrations():
     assert fit(demonstrations(300)) == pytest.approx(WEIGHTS, abs=0.8)
+
+
+def winding(rng: np.random.Generator) -> Demonstration:
+    """A path through every node of a grid, row by row, there and back."""
+    nodes = np.arange(30).reshape(6, 5)
+    nodes[1::2] = nodes[1::2, ::-1]
+    path = nodes.ravel()
+    return Demonstration(grid(rng), path[: 1 + int(np.flatnonzero(path == 29)[0])])
+
+
+def test_weights_at_their_lower_bounds_are_named_and_warned_of(caplog):
+    rng = np.random.default_rng(0)
+    long_ways = [winding(rng) for _ in range(4)]
+    with caplog.at_level("WARNING", "manip_il"):
+        learn("max_entropy", demonstrations(20), rng)
+        assert caplog.messages == []
+        learn("max_entropy", long_ways, rng)
+    [line] = caplog.messages
+    assert f"length ({least_weights(long_ways)[LENGTH]:.0f} / m)" in line

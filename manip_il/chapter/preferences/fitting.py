@@ -33,8 +33,6 @@ _LR = 1e-4
 _WEIGHT_DECAY = 1.0
 _BATCH = 16
 _EPOCHS, _PATIENCE = 200, 15
-_RANGE = (0.01, 0.99)  # quantiles of the frames' rewards that become 0 and 1
-_MOST_FRAMES = 100_000  # of which about as many are enough for the quantiles
 _ROWS = 8_192  # rows evaluated at a time
 
 
@@ -102,11 +100,9 @@ def fit_answers(
         with torch.no_grad():
             every = network.logits(inputs, sides).numpy().astype(np.float64)
             logits = every[folds, np.arange(len(folds))]
-            rewards = torch.cat([network.members(part).mean(0) for part in inputs.split(_ROWS)])
-            some = rewards[:: max(1, len(rewards) // _MOST_FRAMES)]
-            low, high = torch.quantile(some, torch.tensor(_RANGE)).tolist()
-        network.low.fill_(low)
-        network.high.fill_(max(high, low + 1e-6))
+            network.set_range(
+                torch.cat([network.members(part).mean(0) for part in inputs.split(_ROWS)])
+            )
     right = ((logits > 0) == (answers.better > 0.5))[answers.better != 0.5]
     answered = Proportion(int(right.sum()), max(len(right), 1))
     return FittedReward(network, logits, epochs, answered)

@@ -29,6 +29,7 @@ _GRADIENT_TOLERANCE, _LOSS_TOLERANCE = 1e-4, 1e-6  # [m] and relative; L-BFGS-B 
 # smallest feature unit relative to the largest, and the smallest divisor
 _LEAST_UNIT, _TINY = 1e-2, 1e-300
 _ABOVE = 1.001  # safety factor on the smallest weight for which the sum over all paths is finite
+_PINNED = 0.01  # distance from its lower bound at which a weight is pinned, over length's weight
 _TOLERANCE = 1e-14  # relative; longer paths that add less are ignored
 _MOST_EDGES = 20_000  # edges of the longest path that is summed
 
@@ -150,6 +151,15 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
     most = max(int(np.bincount(one.problem.edges[:, 0]).max()) for one in demonstrations)
     found[LENGTH] = _ABOVE * np.log(most) / shortest
     return found
+
+
+def pinned(demonstrations: Sequence[Demonstration], weights: F64) -> list[int]:
+    """Return the indices of the weights (K,) that `fit` left at their lower bounds.
+
+    The demonstrations would have them even smaller.
+    """
+    above = weights - least_weights(demonstrations)
+    return np.flatnonzero(above <= _PINNED * weights[LENGTH]).tolist()
 
 
 def fit(demonstrations: Sequence[Demonstration]) -> F64:

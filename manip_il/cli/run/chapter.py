@@ -114,6 +114,7 @@ def run_irl(options: IrlOptions) -> None:
             folder / inverse.FILE_NAME,
             found.to_json(),
             [inverse.weight_table(found)],
+            *found.facts,
             page=page,
             options=options,
         )
