@@ -10,7 +10,9 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 
+from manip_il import __version__
 from manip_il.sim.render import PACKAGES
 
 from .conftest import IMPORTED_ONCE, LONG
@@ -83,6 +85,33 @@ def test_every_file_that_the_package_reads_is_installed_in_it():
 def test_the_image_and_make_bring_the_packages_that_errors_name():
     assert PACKAGES in (ROOT / "Dockerfile").read_text()
     assert f"({PACKAGES})" in (ROOT / ".ci" / "system").read_text()
+
+
+def test_the_version_is_the_same_wherever_it_is_written():
+    projects = (
+        tomllib.loads((ROOT / one / "pyproject.toml").read_text()) for one in (".", "plugin")
+    )
+    written = {one["project"]["version"] for one in projects}
+    written.add(str(yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"]))
+    assert written == {__version__}
+    assert f'image.version="{__version__}"' in (ROOT / "Dockerfile").read_text()
+    assert f"\n## [{__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_every_extra_that_an_error_or_a_page_names_can_be_installed():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("manip_il/**/*.py")]
+    named = {
+        name
+        for page in pages
+        for names in re.findall(r"manip_il\[([\w,]+)\]", page.read_text(encoding="utf-8"))
+        for name in names.split(",")
+    }
+    assert {"ray", "rl", "serve", "sharing", "view"} <= named <= extras.keys()
+    everything = re.findall(r"\w+", extras["all"][0].partition("[")[2])
+    assert {*everything, "all", "dev"} == extras.keys()
 
 
 def calls(*names: str) -> set[tuple[str, str, str]]:
