@@ -27,7 +27,7 @@ setup: .venv/.installed  ## install the packages into .venv; as root also OpenGL
 .venv/.installed: requirements.lock pyproject.toml plugin/pyproject.toml | $(filter .tools%,$(UV))
 	$(UV) venv --quiet --allow-existing --python $(PYTHON) .venv
 	$(UV) pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock
-	$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e . -e plugin
+	$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e . -e ./plugin
 	touch $@
 
 .venv/.robots: robots.lock .venv/.installed

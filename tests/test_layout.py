@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Written in pieces, so that this file passes its own test.
 REGISTRY = re.compile("|".join(["pypi" + r"\.org", "pythonhosted" + r"\.org", "index" + "-url"]))
+OF_A_CLONE = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="git says what is ours")
 MACHINE_PATH = re.compile(r"(?<![\w./~-])/(?:home|Users|root|work|mnt|data)" + r"/\w")
 
 
@@ -52,6 +53,7 @@ def found(pattern: re.Pattern[str]) -> list[tuple[str, str]]:
     return [(str(path), match.group()) for path, text in texts if (match := pattern.search(text))]
 
 
+@OF_A_CLONE
 @pytest.mark.parametrize("pattern", [REGISTRY, MACHINE_PATH], ids=["registry", "machine"])
 def test_no_file_names_a_registry_host_or_a_path_of_one_machine(pattern: re.Pattern[str]):
     assert found(pattern) == []
@@ -64,6 +66,7 @@ def test_what_the_settings_of_the_tests_name_is_there():
     assert [name for name in LONG if not (ROOT / "tests" / name).is_file()] == []
 
 
+@OF_A_CLONE
 def test_every_file_that_the_package_reads_is_installed_in_it():
     """Not beside it, where it is missing after `pip install --target` or `--user`."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
