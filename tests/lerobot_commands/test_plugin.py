@@ -15,8 +15,11 @@ from ..learn.tiny_policies import write_checkpoint
 pytestmark = pytest.mark.slow
 PLUGIN = Path(__file__).parents[2] / "plugin"
 INSTALL = "from setuptools.build_meta import *; prepare_metadata_for_build_wheel('.')"
-RUN = "import sys; sys.path.insert(0, {folder!r}); sys.argv = {words!r}\n"
-RUN += "from lerobot.scripts.lerobot_eval import main; main()"
+RUN = """import sys
+sys.path.insert(0, {folder!r})
+sys.argv = {words!r}
+from lerobot.scripts.lerobot_eval import main
+main()"""
 
 
 def test_an_unmodified_lerobot_eval_knows_our_environment_and_policy(warm_lerobot, tmp_path):
@@ -30,6 +33,7 @@ def test_an_unmodified_lerobot_eval_knows_our_environment_and_policy(warm_lerobo
         f"--policy.path={policy}",
         "--policy.device=cpu",
         "--env.type=manip_il",
+        "--eval.use_async_envs=false",
     ]
     words += ["--env.task=PandaReach-v0", "--env.episode_length=5", "--env.render_mode=none"]
     words += ["--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={tmp_path / 'eval'}"]
