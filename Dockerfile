@@ -20,12 +20,12 @@ ARG TORCH_BACKEND=
 COPY pyproject.toml requirements.lock ./
 RUN /opt/uv/bin/uv pip compile --quiet --no-header --no-annotate --python /usr/bin/python3 \
         ${TORCH_BACKEND:+--torch-backend=$TORCH_BACKEND} --no-emit-package cmake --no-emit-package triton \
-        --extra so101 --constraints requirements.lock pyproject.toml --output-file runtime.txt
+        --extra rl --extra sharing --extra so101 --constraints requirements.lock pyproject.toml --output-file runtime.txt
 
 FROM debian:trixie-slim
 LABEL org.opencontainers.image.title="manip-il" \
       org.opencontainers.image.description="Robot-arm imitation learning without a human at the controls" \
-      org.opencontainers.image.version="0.1.0" \
+      org.opencontainers.image.version="1.0.0" \
       org.opencontainers.image.licenses="Apache-2.0"
 # OpenGL without a graphics card (Mesa), and FFmpeg's libraries for torchcodec.
 RUN apt-get update -qq \
@@ -54,7 +54,7 @@ RUN --mount=from=uv,source=/opt/uv,target=/opt/uv --mount=from=uv,source=/etc/ss
 # This project alone: a change of its code leaves the packages as they are.
 RUN --mount=from=uv,source=/opt/uv,target=/opt/uv --mount=target=/src,rw \
     /opt/uv/bin/uv pip install --quiet --no-cache --offline --no-deps --no-build-isolation --compile-bytecode \
-        --python /opt/manip-il/bin/python /src
+        --python /opt/manip-il/bin/python /src /src/plugin
 WORKDIR /opt/manip-il/share/manip_il
 COPY configs configs
 # Everything that is written goes under /tmp, so that the root may be read-only and the user anyone, even one without a

@@ -1,6 +1,6 @@
 # `make help` lists the targets.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-eyes test test-together test-clock test-fast lint format docker docker-test bench lock clean
+.PHONY: help setup demo demo-eyes test test-together test-clock test-fast lint format docker docker-test bench lock dist clean
 
 UV_VERSION := 0.13.8
 PYTHON     ?= $(or $(shell command -v python3.12),$(shell command -v python3.13),python3.12)
@@ -24,10 +24,10 @@ setup: .venv/.installed  ## install the packages into .venv; as root also OpenGL
 	$(PYTHON) -m venv .tools
 	.tools/bin/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
 
-.venv/.installed: requirements.lock pyproject.toml | $(filter .tools%,$(UV))
+.venv/.installed: requirements.lock pyproject.toml plugin/pyproject.toml | $(filter .tools%,$(UV))
 	$(UV) venv --quiet --allow-existing --python $(PYTHON) .venv
 	$(UV) pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock
-	$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e .
+	$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e . -e ./plugin
 	touch $@
 
 .venv/.robots: robots.lock .venv/.installed
@@ -87,9 +87,13 @@ bench: setup  ## measure every speed ratio, in about 40 minutes; PEER=PYTHON wit
 	@echo "== benchmarks/time_to_policy.py"; $(BIN)/python benchmarks/time_to_policy.py $(addprefix --peer=,$(PEER))
 
 lock: | $(filter .tools%,$(UV))  ## update requirements.lock after a change of pyproject.toml
-	$(UV) pip compile --quiet --universal --generate-hashes --no-annotate --no-header \
-	    --python $(PYTHON) --extra dev --extra so101 --extra ray --extra tensorboard --extra export --extra serve pyproject.toml -o requirements.lock
+	$(UV) pip compile --quiet --universal --generate-hashes --no-annotate --no-header --python $(PYTHON) --extra dev \
+	    --no-emit-package metaworld pyproject.toml -o requirements.lock # it is in robots.lock
+
+dist: setup  ## build wheels and sdists into dist/; PUBLISHER=https://HOST/OWNER/NAME for the links that an index shows
+	$(UV) build --quiet --no-build-isolation --python $(BIN)/python --out-dir dist .
+	$(UV) build --quiet --no-build-isolation --python $(BIN)/python --out-dir dist plugin
 
 clean:  ## remove files that tools left; keeps .venv, runs and datasets
-	rm -rf build *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf build dist *.egg-info plugin/build plugin/*.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find manip_il tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

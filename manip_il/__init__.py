@@ -16,7 +16,7 @@ if not os.environ.get("MUJOCO_GL") and ctypes.util.find_library("EGL"):
     os.environ["MUJOCO_GL"] = "egl"
 register_envs()
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 _HOMES = {  # public name -> module, and the name there if it differs
     "CameraConfig": "sim.config",
     "Checkpoint": "learn.checkpoint",

@@ -7,7 +7,8 @@ import difflib
 import logging
 import reprlib
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 OWN = "manip_il_own_"  # prefix of the names of modules that are loaded from users' own files
 _LONGEST_PRINTED = 200  # [characters]
@@ -84,15 +85,33 @@ class FolderExistsError(UsageError):
     """
 
     def __init__(self, folder: object):
-        ways = (
-            "--resume=true continues it, if the command has that option; --overwrite=true"
-            " replaces it"
+        super().__init__(
+            f"{folder} already exists; --resume=true continues it, if the command has that option;"
+            " --overwrite=true replaces it; or choose another folder"
         )
-        super().__init__(f"{folder} already exists; {ways}; or choose another folder")
 
 
 class RenderError(ManipError):
     """OpenGL for off-screen rendering does not work."""
+
+
+@contextmanager
+def requires(what: str, install: str) -> Iterator[None]:
+    """Import packages that not every installation has.
+
+    Args:
+        what: What needs them, for the message.
+        install: The words that follow `pip install`.
+
+    Raises:
+        ManipError: If a package is missing; the message says how to install it.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ManipError(
+            f"{what} needs {error.name}, which is not installed: pip install {install}"
+        ) from error
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

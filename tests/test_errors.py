@@ -1,10 +1,13 @@
+import importlib
 import pickle
+import re
+import sys
 
 import pytest
 
 from manip_il.cli.main import main
 from manip_il.cli.outputs import say
-from manip_il.errors import UnknownName, nearest, shorten, warn
+from manip_il.errors import ManipError, UnknownName, nearest, requires, shorten, warn
 from manip_il.evaluation.report import Table
 
 
@@ -34,3 +37,13 @@ def test_a_huge_structure_is_not_printed_as_a_whole():
     for _ in range(60):  # 9^60 values
         value = {"a": [value] * 9}
     assert len(shorten(value)) <= 200
+
+
+def test_a_missing_package_is_one_line_that_says_what_to_type(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed
+    monkeypatch.delitem(sys.modules, "manip_il.collect.ray_pool", raising=False)
+    line = "--engine=ray needs ray, which is not installed: pip install 'manip_il[ray]'"
+    with pytest.raises(ManipError, match=re.escape(line)):
+        importlib.import_module("manip_il.collect.ray_pool")
+    with pytest.raises(ValueError, match="own"), requires("a policy", "torch"):
+        raise ValueError("other errors are told as they are: our own")

@@ -10,7 +10,9 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 
+from manip_il import __version__
 from manip_il.sim.render import PACKAGES
 
 from .conftest import IMPORTED_ONCE, LONG
@@ -19,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Written in pieces, so that this file passes its own test.
 REGISTRY = re.compile("|".join(["pypi" + r"\.org", "pythonhosted" + r"\.org", "index" + "-url"]))
+OF_A_CLONE = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="git says what is ours")
 MACHINE_PATH = re.compile(r"(?<![\w./~-])/(?:home|Users|root|work|mnt|data)" + r"/\w")
 
 
@@ -50,6 +53,7 @@ def found(pattern: re.Pattern[str]) -> list[tuple[str, str]]:
     return [(str(path), match.group()) for path, text in texts if (match := pattern.search(text))]
 
 
+@OF_A_CLONE
 @pytest.mark.parametrize("pattern", [REGISTRY, MACHINE_PATH], ids=["registry", "machine"])
 def test_no_file_names_a_registry_host_or_a_path_of_one_machine(pattern: re.Pattern[str]):
     assert found(pattern) == []
@@ -62,6 +66,7 @@ def test_what_the_settings_of_the_tests_name_is_there():
     assert [name for name in LONG if not (ROOT / "tests" / name).is_file()] == []
 
 
+@OF_A_CLONE
 def test_every_file_that_the_package_reads_is_installed_in_it():
     """Not beside it, where it is missing after `pip install --target` or `--user`."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
@@ -83,6 +88,33 @@ def test_every_file_that_the_package_reads_is_installed_in_it():
 def test_the_image_and_make_bring_the_packages_that_errors_name():
     assert PACKAGES in (ROOT / "Dockerfile").read_text()
     assert f"({PACKAGES})" in (ROOT / ".ci" / "system").read_text()
+
+
+def test_the_version_is_the_same_wherever_it_is_written():
+    projects = (
+        tomllib.loads((ROOT / one / "pyproject.toml").read_text()) for one in (".", "plugin")
+    )
+    written = {one["project"]["version"] for one in projects}
+    written.add(str(yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"]))
+    assert written == {__version__}
+    assert f'image.version="{__version__}"' in (ROOT / "Dockerfile").read_text()
+    assert f"\n## [{__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_every_extra_that_an_error_or_a_page_names_can_be_installed():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("manip_il/**/*.py")]
+    named = {
+        name
+        for page in pages
+        for names in re.findall(r"manip_il\[([\w,]+)\]", page.read_text(encoding="utf-8"))
+        for name in names.split(",")
+    }
+    assert {"ray", "rl", "serve", "sharing", "view"} <= named <= extras.keys()
+    everything = re.findall(r"\w+", extras["all"][0].partition("[")[2])
+    assert {*everything, "all", "dev"} == extras.keys()
 
 
 def calls(*names: str) -> set[tuple[str, str, str]]:

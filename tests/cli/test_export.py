@@ -55,7 +55,10 @@ def test_it_tells_how_near_the_checkpoint_the_file_is(here, capsys):
     ("kind", "line"),
     [
         ("act", "POLICY is a policy of type 'act'; only mlp and cnn can be exported"),
-        ("mlp", "an ONNX file needs onnxruntime: pip install 'manip_il[export]'"),
+        (
+            "mlp",
+            "an ONNX file needs onnxruntime, which is not installed: pip install 'manip_il[export]'",
+        ),
     ],
 )
 def test_what_cannot_be_exported_is_one_line(here, error, monkeypatch, kind, line):

@@ -11,6 +11,7 @@ from manip_il.cli.main import COMMANDS
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (
     "README.md",
+    "CONTRIBUTING.md",
     *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/**/*.md")),
     "benchmarks/README.md",
     "datasets/README.md",

@@ -9,27 +9,22 @@ to older files sends nothing.
 """
 
 import hashlib
-import logging
 import re
 import secrets
 import tempfile
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, override
-from urllib.parse import unquote
 
 import fsspec
-import paramiko
 from fsspec.callbacks import TqdmCallback
 from fsspec.implementations.local import LocalFileSystem
-from fsspec.implementations.sftp import SFTPFileSystem
 
 from manip_il import checks
 from manip_il.bridges.store.errors import RemoteError, explained
 from manip_il.bridges.store.manifest import MANIFEST_FILE, Arrival, Kind, Manifest, PushPlan
 from manip_il.errors import UnknownName, UsageError
 
-TIMEOUT = 30.0  # for connecting to an ssh server, and for each response [s]
 # for object stores: no stale listings
 _FRESH = {"skip_instance_cache": True, "use_listings_cache": False}
 _S3 = {"max_concurrency": 4, "config_kwargs": {"read_timeout": 120}, **_FRESH}
@@ -62,76 +57,17 @@ class Local(LocalFileSystem):
             RemoteError: if it is not a regular file, or has more bytes than expected.
         """
         with checks.open_outside(Path(path1), "a file of a push", RemoteError) as source:
-            _copy(source, path2, callback)
+            copy(source, path2, callback)
 
 
-class Sftp(SFTPFileSystem):
-    """SFTP with the user's ~/.ssh/config, to hosts in ~/.ssh/known_hosts only.
+def copy(source: Any, target: str, arrival: Arrival) -> None:
+    """Copy an open file and count its bytes.
 
-    Fsspec's class accepts any host key.
+    Args:
+        source: The open file.
+        target: The new file.
+        arrival: What counts the bytes, and raises `RemoteError` if there are too many.
     """
-
-    cachable = False
-    put: Any = fsspec.AbstractFileSystem.put  # fsspec's SFTP class can put only a single file
-
-    def _connect(self) -> None:
-        # paramiko also raises the errors that it logs
-        logging.getLogger("paramiko").setLevel(logging.CRITICAL)
-        config, login = Path.home() / ".ssh" / "config", self.ssh_kwargs
-        known = (
-            dict(paramiko.SSHConfig.from_path(str(config)).lookup(self.host))
-            if config.is_file()
-            else {}
-        )
-        self.client = paramiko.SSHClient()
-        self.client.load_system_host_keys()
-        self.client.set_missing_host_key_policy(paramiko.RejectPolicy())
-        self.client.connect(
-            str(known.get("hostname", self.host.strip("[]"))),
-            login.get("port") or int(known.get("port", 22)),
-            login.get("username") or known.get("user"),
-            unquote(login.get("password") or "") or None,
-            key_filename=known.get("identityfile"),
-            timeout=TIMEOUT,
-        )
-        self.ftp = self.client.open_sftp()
-        self.ftp.get_channel().settimeout(TIMEOUT)  # pyright: ignore[reportOptionalMemberAccess]
-
-    @override
-    def put_file(
-        self, lpath: Any, rpath: Any, callback: Any = None, mode: str = "", **kwargs: Any
-    ) -> None:
-        """Upload a file and make its folder.
-
-        Args:
-            lpath: The file on this machine.
-            rpath: The path on the server.
-            callback: Ignored.
-            mode: Ignored.
-            kwargs: Ignored.
-        """
-        self.makedirs(self._parent(rpath), exist_ok=True)
-        self.ftp.put(str(lpath), str(rpath))
-
-    @override
-    def get_file(self, rpath: Any, lpath: Any, callback: Any = None, **kwargs: Any) -> None:
-        """Download a file and count its bytes.
-
-        Args:
-            rpath: The path on the server.
-            lpath: The new file on this machine.
-            callback: The `Arrival` that counts the bytes.
-            kwargs: Ignored.
-
-        Raises:
-            RemoteError: if the file has more bytes than expected.
-        """
-        with self.ftp.open(str(rpath)) as source:
-            source.prefetch(min(source.stat().st_size or 0, callback.most))
-            _copy(source, lpath, callback)
-
-
-def _copy(source: Any, target: str, arrival: Arrival) -> None:
     with open(target, "wb") as file:
         for chunk in iter(partial(source.read, _CHUNK), b""):
             arrival.update(len(chunk))
@@ -164,19 +100,26 @@ class Objects:
         self._scheme, self.quiet = scheme, quiet
         self.name = re.sub(r"(?<=://)([^/@:]*):.*@", r"\1@", url)
         try:
-            own = {"file": Local, "sftp": Sftp}
-            self._class: Any = own.get(scheme) or fsspec.get_filesystem_class(scheme)
+            if scheme == "sftp":
+                from manip_il.bridges.store.sftp import Sftp  # paramiko is an extra
+
+                self._class: Any = Sftp
+            else:
+                self._class = Local if scheme == "file" else fsspec.get_filesystem_class(scheme)
         except ImportError as error:
-            raise UsageError(f"{scheme}:// needs another package: {error}") from None
+            how = "pip install 'manip_il[sharing]'" if scheme in _OPTIONS else error
+            raise UsageError(f"{scheme}:// needs another package: {how}") from None
         except ValueError:
-            known = ("hf://", "s3://", "sftp://", "file://", "gs://", "az://")
-            raise UnknownName("scheme", f"{scheme}://", known) from None
+            raise UnknownName(
+                "scheme",
+                f"{scheme}://",
+                ("hf://", "s3://", "sftp://", "file://", "gs://", "az://"),
+            ) from None
         if scheme == "sftp" and not _SFTP.fullmatch(url):
-            text = (
-                "expected sftp://[USER@]HOST[:PORT]/FOLDER; in a password write / as %2F, @ as %40,"
-                " : as %3A"
+            raise UsageError(
+                "the sftp:// address is invalid; expected sftp://[USER@]HOST[:PORT]/FOLDER; in a"
+                " password write / as %2F, @ as %40, : as %3A"
             )
-            raise UsageError(f"the sftp:// address is invalid; {text}")
         self.at_once = _AT_ONCE if self._class.async_impl else 1
         self._login, place = (
             self._class._get_kwargs_from_urls(url),
@@ -221,9 +164,7 @@ class Objects:
                 if there.get(file.sha256) != file.size
             }
             sources = [str(plan.local[path]) for path in missing.values()]
-            bar = TqdmCallback(
-                {"desc": "push", "unit": " files", "disable": True if self.quiet else None}
-            )
+            bar = TqdmCallback({"desc": "push", "unit": " files", "disable": self.quiet or None})
             at_once = {"batch_size": _SENT_AT_ONCE} if self._fs.async_impl else {}
             self._fs.put(sources, [self._object(key) for key in missing], callback=bar, **at_once)
             for path in missing.values():
@@ -273,8 +214,9 @@ class Objects:
                 )
         except OSError as error:
             if is_outdated():  # or this push succeeded, and its answer was lost
-                text = "was changed by another push in the meantime; push again"
-                raise RemoteError(f"{self.name} {text}") from error
+                raise RemoteError(
+                    f"{self.name} was changed by another push in the meantime; push again"
+                ) from error
             raise
 
     def _object(self, key: str) -> str:

@@ -6,10 +6,12 @@ from manip_il.cli.outputs import save_options, say
 from manip_il.cli.robots import ServeOptions
 from manip_il.collect.inputs import env_config
 from manip_il.data.atomic import exclusive, output_of, require_ours
-from manip_il.errors import UsageError
+from manip_il.errors import UsageError, requires
 from manip_il.evaluation.suites import varied
 from manip_il.serve.config import SessionConfig
-from manip_il.serve.session import serve
+
+with requires("serve", "'manip_il[serve]'"):
+    from manip_il.serve.session import serve
 
 SERVO = "servo"  # a value of --vary
 

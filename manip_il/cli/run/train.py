@@ -11,7 +11,7 @@ from manip_il.cli.outputs import Stages, say, say_next, set_quiet
 from manip_il.cli.transfer import ExportOptions
 from manip_il.collect.inputs import named_env, open_dataset
 from manip_il.data.atomic import write_file
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, requires
 from manip_il.learn.checkpoint import Checkpoint
 from manip_il.learn.export import export_onnx
 from manip_il.learn.train import train
@@ -59,12 +59,8 @@ def run_export(options: ExportOptions) -> None:
             f"{path} is a policy of type {policy.kind!r}; only {' and '.join(EXPORTABLE)} can be"
             " exported"
         )
-    try:
+    with requires("an ONNX file", "'manip_il[export]'"):
         content, difference = export_onnx(policy)
-    except ImportError as error:
-        raise ManipError(
-            f"an ONNX file needs {error.name}: pip install 'manip_il[export]'"
-        ) from error
     write_file(options.output, content)
     say(f"largest difference from {path} over random observations: {difference:.1e}")
     say(f"exported: {options.output} ({len(content):,} bytes)")

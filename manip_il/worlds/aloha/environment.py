@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.caching import cached_per_thread
-from manip_il.errors import RenderError
+from manip_il.errors import RenderError, requires
 from manip_il.mdp import F64, Label, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CameraConfig
@@ -25,7 +25,7 @@ from manip_il.worlds.aloha.transfer import Transfer
 from manip_il.worlds.config import WORLDS
 from manip_il.worlds.contract import GRIPPERS as GRIPPERS_OF
 from manip_il.worlds.contract import TWO_ARMS, EnvironmentSpec, Outcome
-from manip_il.worlds.gym.environment import GymEnv, GymKind, coordinates, installed
+from manip_il.worlds.gym.environment import GymEnv, GymKind, coordinates
 from manip_il.worlds.gym.restoring import WHOLE, physics_of
 from manip_il.worlds.gym.world import AGENT, AROUND, GymWorld
 
@@ -33,10 +33,7 @@ ALOHA_TASKS = {task.name: task for task in (Transfer, Insertion)}
 _JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
 # as in `lerobot/aloha_sim_*`
 NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in _JOINTS)
-INSTALL = (
-    "pip install --no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10"
-    " lxml==6.1.3"
-)
+INSTALL = "--no-deps gym-aloha==0.1.5 dm-control==1.0.44 dm-env==1.6 dm-tree==0.1.10 lxml==6.1.3"
 MOST_REWARD = 4
 GRIPPERS = np.array(GRIPPERS_OF[TWO_ARMS])
 LONGEST = 0.04  # longest step of a joint, as for the expert [rad]
@@ -75,7 +72,7 @@ class Aloha(GymWorld):
         self.about = ALOHA_TASKS[self.task]
         self.instruction = self.about.instruction
         self.phases = phases(self.about)
-        with installed(self, INSTALL):
+        with requires("aloha", INSTALL):
             env = import_module("gym_aloha.env").AlohaEnv(self.about.own)
         self.physics, self._task = env._env.physics, env._env.task
         self.model, self.data = self.physics.model.ptr, self.physics.data.ptr

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, replace
 from functools import cache, partial
@@ -398,20 +397,6 @@ def made(world: GymWorld) -> gymnasium.Env[Any, Any]:
             f"{_at(world, 'make')}: returned {checks.shorten(env)}; expected a gymnasium.Env"
         )
     return env
-
-
-@contextmanager
-def installed(world: GymWorld, how: str) -> Iterator[None]:
-    """Import the package that a world comes from.
-
-    Raises `ManipError` with the command that installs it if something is not installed.
-    """
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise ManipError(
-            f"{_name(world)} needs {error.name}, which is not installed: {how}"
-        ) from error
 
 
 def settings_of(world: GymWorld, env: gymnasium.Env[Any, Any] | None) -> dict[str, Any]:
