@@ -209,17 +209,16 @@ class Preflight:
         """Check direction and units of the gripper by the pictures, then its range."""
         at, name = self.state[-1], self.scene.robot.joint_names[-1]
         reverse = 100 - at
-        meant = {
-            "reversed, with 0 for open": reverse,
-            "from 0 to 1, and the policy reads 0 to 100": 100 * at,
-            "in radians, and the policy reads 0 to 100": in_units(
-                self.scene.robot, self.state[None]
-            )[0, -1],
-        }
-        gains = {text: self._gain(other) for text, other in meant.items() if 0 <= other <= 100}
-        text = max(gains, key=gains.__getitem__, default="")
-        if text and gains[text] > _NEARER:
-            yield Finding(STATE, f"{name} is {text}: so the pictures show it", _START)
+        angle = in_units(self.scene.robot, self.state[None])[0, -1]
+        units = "in radians or from 0 to 1, and the policy reads 0 to 100"
+        meant = ((units, 100 * at), (units, angle), ("reversed, with 0 for open", reverse))
+        likely = [
+            text
+            for text, other in meant
+            if 0 <= other <= 100 and self._gain(other) > _NEARER  # [%]
+        ]
+        if likely:
+            yield Finding(STATE, f"{name} is {likely[0]}: so the pictures show it", _START)
         elif self._distances(self.state)[-1] > 1:
             is_reversed = self._distances(np.append(self.state[:-1], reverse))[-1] <= 1
             yield self._out_of_range(len(self.state) - 1, "reversed" if is_reversed else "")
@@ -265,7 +264,8 @@ class Preflight:
 
 def _resized(picture: Picture, size: tuple[int, int]) -> Picture:
     """Return a picture (h, w, 3) of another height and width."""
-    return np.array(Image.fromarray(picture).resize(size[::-1], Image.Resampling.BOX))
+    height, width = size
+    return np.array(Image.fromarray(picture).resize((width, height), Image.Resampling.BOX))
 
 
 def _shrink(picture: Picture) -> F64:

@@ -166,8 +166,8 @@ PLANTED: list[tuple[Any, str]] = [
     (with_joint(0, lambda angle: angle - 360), "off by -1 turn"),
     (with_joint(2, lambda angle: angle + 80), "elbow_flex.pos is at"),
     (with_joint(5, lambda opening: 100 - opening), "reversed"),
-    (with_joint(5, lambda opening: opening / 100), "gripper.pos is from 0 to 1"),
-    (gripper_in_radians, "gripper.pos is in radians"),
+    (with_joint(5, lambda opening: opening / 100), "gripper.pos is in radians or from 0 to 1"),
+    (gripper_in_radians, "gripper.pos is in radians or from 0 to 1"),
     (lambda one: replace(one, names=tuple(n[:-4] for n in one.names)), "names of the joints"),
     (reordered, "order of the joints"),
 ]
