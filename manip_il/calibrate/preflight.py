@@ -208,20 +208,20 @@ class Preflight:
     def _check_gripper(self) -> Iterator[Finding]:
         """Check direction and units of the gripper by the pictures, then its range."""
         at, name = self.state[-1], self.scene.robot.joint_names[-1]
-        reverse = 100 - at
         angle = in_units(self.scene.robot, self.state[None])[0, -1]
         units = "in radians or from 0 to 1, and the policy reads 0 to 100"
-        meant = ((units, 100 * at), (units, angle), ("reversed, with 0 for open", reverse))
-        likely = [
-            text
-            for text, other in meant
-            if 0 <= other <= 100 and self._gain(other) > _NEARER  # [%]
-        ]
+        meant = ((units, 100 * at), (units, angle), ("reversed, with 0 for open", 100 - at))
+        known = [(text, other) for text, other in meant if not self._is_beyond(other)]
+        likely = [text for text, other in known if self._gain(other) > _NEARER]
         if likely:
             yield Finding(STATE, f"{name} is {likely[0]}: so the pictures show it", _START)
-        elif self._distances(self.state)[-1] > 1:
-            is_reversed = self._distances(np.append(self.state[:-1], reverse))[-1] <= 1
+        elif self._is_beyond(at):
+            is_reversed = not self._is_beyond(100 - at)
             yield self._out_of_range(len(self.state) - 1, "reversed" if is_reversed else "")
+
+    def _is_beyond(self, gripper: float) -> bool:
+        """Return whether an opening of the gripper [%] is outside the training data."""
+        return bool(self._distances(np.append(self.state[:-1], gripper))[-1] > 1)
 
     def _gain(self, gripper: float) -> float:
         """Return how much nearer the pictures are to another opening of the gripper, 0 to 100."""
