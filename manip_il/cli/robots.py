@@ -168,7 +168,7 @@ class PreflightOptions(Trusting, Output):
     with simulated ones, and the policy's first target. Prints a line for each fault with what to
     do, and writes report.html with the pictures. Nothing moves. The exit code is 1 for no-go.
 
-    Example: manip-il robot preflight datasets/rest --policy.path=runs/lift
+    Example: manip-il robot preflight datasets/rest --policy.path=runs/arm
     """
 
     dataset: Path = option(MISSING, "what lerobot-record made of the arm", positional=True)
