@@ -82,6 +82,10 @@ COMMANDS = {
     "robot check": ("robots:RobotCheckOptions", "measure what an arm can do, before recording"),
     "robot certify": ("robots:CertifyOptions", "measure from which states the expert recovers"),
     "robot identify": ("robots:IdentifyOptions", "find a real arm's servos from a dataset"),
+    "robot preflight": (
+        "robots:PreflightOptions",
+        "check a policy against a recording of the real arm, before it moves",
+    ),
     "robot excite": ("robots:ExciteOptions", "write a motion that tells a real arm's servos"),
     "env check": (
         "robots:EnvCheckOptions:env",

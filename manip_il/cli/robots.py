@@ -2,8 +2,9 @@
 
 `manip-il serve`: a virtual SO-101 behind serial ports, for LeRobot's own programs.
 
-`manip-il robot new`, `check`, `certify`, `identify`, `excite`: a YAML file for your own arm, what
-the arm and its expert can do, the servos of a real one, and a motion that tells them.
+`manip-il robot new`, `check`, `certify`, `identify`, `excite`, `preflight`: a YAML file for your
+own arm, what the arm and its expert can do, the servos of a real one, a motion that tells them, and
+whether a policy fits the arm.
 """
 
 from dataclasses import MISSING, dataclass, field
@@ -157,6 +158,29 @@ class ExciteOptions(Replacing, Seeded):
     dataset: Path = option(MISSING, "folder of the new dataset", positional=True)
     robot: NameOrPath = option("so101", "the arm", flag="robot.type")
     seconds: float = option(120.0, "length of the motion [s]", at_least=6, at_most=3600)
+
+
+@dataclass(frozen=True)
+class PreflightOptions(Trusting, Output):
+    """Check a policy against a few recorded seconds of the real arm at rest: go, or no-go.
+
+    Compares names, units and ranges of the joints, cameras, sizes, colours and rate, the pictures
+    with simulated ones, and the policy's first target. Prints a line for each fault with what to
+    do, and writes report.html with the pictures. Nothing moves. The exit code is 1 for no-go.
+
+    Example: manip-il robot preflight datasets/rest --policy.path=runs/arm
+    """
+
+    dataset: Path = option(MISSING, "what lerobot-record made of the arm", positional=True)
+    policy: Path = option(MISSING, "a checkpoint or a run", flag="policy.path")
+    robot: NameOrPath = option("", "the arm; by default the policy's", flag="robot.type")
+    limit: float = option(
+        10.0,
+        "as in LeRobot: largest distance of a target [deg]",
+        flag="robot.max_relative_target",
+        at_least=0,
+    )
+    output_dir: Path = output_folder("runs/preflight")
 
 
 @dataclass(frozen=True)

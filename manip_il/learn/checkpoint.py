@@ -20,6 +20,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from safetensors.numpy import load_file
+
 from manip_il import checks
 from manip_il.data.fingerprint import policy_sha256
 from manip_il.data.schema import (
@@ -32,6 +34,7 @@ from manip_il.data.schema import (
 )
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.names import ACTION_SPACES, JOINT_TARGET, OWN_SPACE, PLAIN
+from manip_il.mdp import F64
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.worlds.contract import EnvironmentSpec
 
@@ -46,6 +49,7 @@ _STEPS = (  # registry names of LeRobot's default steps, and ours: they load not
     *("normalizer_processor", "unnormalizer_processor", MEASURED, DECODER, JOINTS_ALONE),
 )
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+_STATISTICS = "*_normalizer_processor.safetensors"  # of the training data
 MOST_VALUES = 10_000  # in one numeric input of a network, or in its action
 _IK_ROBOT = "robot of the inverse kinematics"
 # prefix of dummy cameras that LeRobot's language policies fill in themselves
@@ -238,6 +242,19 @@ class Checkpoint:
     def sha256(self) -> str:
         """The hash of everything that decides how the policy acts, see `policy_sha256`."""
         return policy_sha256(self.path)
+
+    @cached_property
+    def state_range(self) -> tuple[F64, F64]:
+        """The least and the greatest joint state in the training data, (n,) each.
+
+        Raises `ManipError` if the checkpoint has no statistics of it.
+        """
+        with in_one_line(f"{self.path} has no statistics of {STATE}"):
+            [path] = self.path.glob(_STATISTICS)
+            with checks.native_path(path, "statistics") as opened:
+                found = load_file(opened)
+            low, high = (found[f"{STATE}.{end}"].astype(float) for end in ("min", "max"))
+            return low, high
 
     @property
     def kind(self) -> str:

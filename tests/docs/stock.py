@@ -20,6 +20,11 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
         ("datasets/session", "datasets/session.journals"),
         "record --robot.type=so101 --task.type=lift --dataset.root=datasets/session",
     ),
+    "datasets/rest": (
+        "record --robot.type=so101 --task.type=lift --cameras=front,wrist"
+        " --dataset.root=datasets/rest"
+    ),
+    "runs/arm": "train --policy.type=cnn --dataset.root=datasets/rest --output_dir=runs/arm",
     "datasets/carry": "record --task.type=carry --dataset.root=datasets/carry",
     "runs/irl": "irl datasets/carry --output_dir=runs/irl",
     "demos_mcap": "data to-mcap datasets/demos demos_mcap",

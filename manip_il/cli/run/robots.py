@@ -1,4 +1,4 @@
-"""Run `manip-il robot new`, `check`, `certify`, `identify`, `excite`."""
+"""Run `manip-il robot new`, `check`, `certify`, `identify`, `excite`, `preflight`."""
 
 import os
 from dataclasses import replace
@@ -7,15 +7,18 @@ from pathlib import Path
 import numpy as np
 
 from manip_il import checks
+from manip_il.bridges.doctor.examine import examine_folder
 from manip_il.calibrate.excite import excite
 from manip_il.calibrate.page import advice as untold
 from manip_il.calibrate.page import identified_report, servo_table, to_yaml
+from manip_il.calibrate.preflight import Preflight
 from manip_il.calibrate.servos import ROUNDS, ServoArm, identify, in_units, motions_of
 from manip_il.cli.outputs import OutputFile, about, progress, publish, say
 from manip_il.cli.robots import (
     CertifyOptions,
     ExciteOptions,
     IdentifyOptions,
+    PreflightOptions,
     RobotCheckOptions,
     RobotNewOptions,
 )
@@ -26,6 +29,7 @@ from manip_il.data.dataset import Dataset, EpisodeData
 from manip_il.data.lerobot_write import write_episodes
 from manip_il.errors import ManipError
 from manip_il.evaluation.certify import FILE_NAME, certify, count_episodes
+from manip_il.evaluation.report import Report, Section
 from manip_il.evaluation.robot_check import FILE_NAME as CHECK_FILE
 from manip_il.evaluation.robot_check import (
     advice,
@@ -33,6 +37,7 @@ from manip_il.evaluation.robot_check import (
     check_robot,
     verdict,
 )
+from manip_il.learn.policy import LearnedPolicy
 from manip_il.progress import Progress
 from manip_il.robots.found import suggest, yaml_of
 from manip_il.robots.gripper import sweep
@@ -127,6 +132,32 @@ def run_identify(options: IdentifyOptions) -> None:
         page = replace(identified_report(found, dataset.fps), **about(options))
         servo_table(found).print()
         say(*untold(found), f"robot: {path}", f"report: {page.write(folder)}")
+
+
+def run_preflight(options: PreflightOptions) -> None:
+    """Compare, write the page, print every finding. Raises `ManipError` for no-go."""
+    dataset = Dataset.open(options.dataset)
+    policy = LearnedPolicy.load(options.policy, task=dataset.instruction, trust=options.trust)
+    origin = policy.checkpoint.origin
+    robot = options.robot or (origin.robot if origin else "so101")
+    preflight = Preflight(dataset, policy, scene_of(robot, "reach"), options.limit)
+    with options.open() as folder:
+        findings = examine_folder(options.dataset, [preflight.check])
+        errors = sum(finding.is_error for finding in findings)
+        verdict = f"no-go, faults: {errors}" if errors else "go"
+        figure = preflight.figure()
+        section = Section("Recorded and simulated", figures=(figure,) if figure else ())
+        page = Report(
+            title="Preflight",
+            verdict=f"{options.dataset}: {verdict}.",
+            sections=(section,),
+            facts=tuple(map(str, findings)),
+            **about(options),
+        )
+        say(*map(str, findings), f"report: {page.write(folder)}")
+    if errors:
+        raise ManipError(f"{options.dataset}: {verdict}; see above")
+    say(f"{options.dataset}: {verdict}")
 
 
 def run_excite(options: ExciteOptions) -> None:
