@@ -196,7 +196,6 @@ def _perturbed(kind: str, env: EnvConfig, moments: Mapping[int, int]) -> Rollout
     return RolloutJob(env, hold=0, conditions=(Perturbation(kind, moments),))
 
 
-
 def certify(
     engine: Engine,
     env: EnvConfig,

@@ -30,7 +30,9 @@ def margin(shown: Demonstration, path: np.ndarray) -> float:
 
 
 def objective(shown: list[Demonstration], weights: np.ndarray) -> float:
-    return np.mean([loss_of(one, weights)[0] for one in shown]) + RIDGE / 2 * weights @ weights
+    return (
+        float(np.mean([loss_of(one, weights)[0] for one in shown])) + RIDGE / 2 * weights @ weights
+    )
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, override
 
@@ -28,6 +29,7 @@ CHECKPOINTS, LAST = "checkpoints", "last"
 CARD, CONFIG = "README.md", "config.json"
 _POLICIES = ("pretrained_model", "best/pretrained_model")
 _CHECKPOINT = re.compile(rf"{CHECKPOINTS}/\d+/pretrained_model")
+_CHUNK = 2**20  # bytes that are copied at a time
 _LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
 # names of files that hold data; all others could be code, or pickles, which can run code
 _DATA = re.compile(
@@ -174,6 +176,13 @@ class Arrival(Callback):
     def update(self, count: float | None = 1) -> None:
         """Count more bytes."""
         self.relative_update(int(count or 0))
+
+    def copy(self, source: Any, target: str) -> None:
+        """Copy an open file to a new one, and count its bytes."""
+        with open(target, "wb") as file:
+            for chunk in iter(partial(source.read, _CHUNK), b""):
+                self.update(len(chunk))
+                file.write(chunk)
 
 
 def check_path(path: object) -> None:

@@ -12,7 +12,7 @@ import hashlib
 import re
 import secrets
 import tempfile
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, override
 
@@ -37,7 +37,6 @@ _SFTP = re.compile(
 # sends
 _AT_ONCE = 10
 _SENT_AT_ONCE = 5
-_CHUNK = 2**20  # [bytes]
 
 
 class Local(LocalFileSystem):
@@ -57,21 +56,7 @@ class Local(LocalFileSystem):
             RemoteError: if it is not a regular file, or has more bytes than expected.
         """
         with checks.open_outside(Path(path1), "a file of a push", RemoteError) as source:
-            copy(source, path2, callback)
-
-
-def copy(source: Any, target: str, arrival: Arrival) -> None:
-    """Copy an open file and count its bytes.
-
-    Args:
-        source: The open file.
-        target: The new file.
-        arrival: What counts the bytes, and raises `RemoteError` if there are too many.
-    """
-    with open(target, "wb") as file:
-        for chunk in iter(partial(source.read, _CHUNK), b""):
-            arrival.update(len(chunk))
-            file.write(chunk)
+            callback.copy(source, path2)
 
 
 class Objects:

@@ -9,8 +9,6 @@ import fsspec
 import paramiko
 from fsspec.implementations.sftp import SFTPFileSystem
 
-from manip_il.bridges.store.objects import copy
-
 TIMEOUT = 30.0  # for connecting, and for each response [s]
 
 
@@ -77,4 +75,4 @@ class Sftp(SFTPFileSystem):
         """
         with self.ftp.open(str(rpath)) as source:
             source.prefetch(min(source.stat().st_size or 0, callback.most))
-            copy(source, lpath, callback)
+            callback.copy(source, lpath)
