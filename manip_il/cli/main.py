@@ -83,6 +83,8 @@ COMMANDS = {
     "robot certify": ("robots:CertifyOptions", "measure from which states the expert recovers"),
     "robot identify": ("robots:IdentifyOptions", "find a real arm's servos from a dataset"),
     "robot excite": ("robots:ExciteOptions", "write a motion that tells a real arm's servos"),
+    "robot board": ("robots:BoardOptions", "write a board to print, for `robot align`"),
+    "robot align": ("robots:AlignOptions", "find a real arm's cameras and zeros from a dataset"),
     "env check": (
         "robots:EnvCheckOptions:env",
         "does a world of your own keep the contract, and how good is its expert",
