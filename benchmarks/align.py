@@ -2,15 +2,19 @@
 
 Usage: python benchmarks/align.py [--seed=0] [--arms=20] [--rests=50] [--play=0]
 
-Each arm is a virtual SO-101 whose cameras stand elsewhere than the nominal ones (the fixed one by up
-to 5 cm, the one on the hand by up to 1.5 cm, both by up to 5 degrees, focal lengths by up to 10 %),
-with distorted lenses and zeros off by up to 2 degrees. A board lies at four places; the arm rests in
-random postures, and its encoders have their own steps. `--play` adds backlash [degrees]. Pictures of
-640 x 480 are drawn, distorted, blurred, made noisy and stored as JPEG.
+Each arm is a virtual SO-101 whose cameras stand elsewhere than the nominal ones (the fixed one by
+up to 5 cm, the one on the hand by up to 1.5 cm, both by up to 5 degrees, focal lengths by up to
+10 %), with distorted lenses and zeros off by up to 2 degrees. A board lies at four places; the arm
+rests in random postures, and its encoders have their own steps. `--play` adds backlash [degrees].
+Pictures of 640 x 480 are drawn, distorted, blurred, made noisy and stored as JPEG.
 
 Prints the median error of the fingertips in the fixed camera's frame and of a point of the table,
-located by the fixed camera, in the wrist camera's frame; and how many of the true values are in their
-95 % intervals. Values are compared with the pan's and the roll's zero as `align` holds them.
+located by the fixed camera, in the wrist camera's frame; and how many of the true values are in
+their 95 % intervals. Values are compared with the pan's and the roll's zero as `align` holds them.
+
+This file is also a task: `manip-il serve --task.type=benchmarks/align.py` has the board on the
+table, at another place in every world, and `--robot.type=` may name a YAML with other cameras and
+zeros.
 """
 
 import argparse

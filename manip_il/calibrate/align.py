@@ -34,6 +34,7 @@ from manip_il.robots.spec import arm_model
 ZERO = np.radians(3.0)  # of a joint's zero [rad]
 _FLAT, _LEVEL = 1e-3, 0.005  # of the board's height over the table [m] and of its tilt [rad]
 _BENT = 0.1  # of a coefficient of distortion
+_FOCAL = 0.5  # of the logarithm of the focal length in widths of the picture
 _SIZES = 0.1, 0.1, 0.002  # of the print's relative size, in each round
 ROUNDS = len(_SIZES)
 _MISPRINT, _SURE = 0.01, 4.0  # relative error of the print that is refused, and in deviations
@@ -137,7 +138,7 @@ def align(
     sizes = {name: size for name, size in found.sizes.items() if name in _cameras_of(found.used)}
     problem = _Problem(robot, sizes, _merged(found.used))
     values, thrown = problem.start(), found.thrown.copy()
-    pixel, encoder = _PIXEL, _ENCODER
+    pixel, encoder = np.full(len(sizes), _PIXEL), _ENCODER
     deviations = np.empty_like(values)
     for size in _SIZES:
         roots = problem.roots(values, pixel, encoder)
@@ -148,6 +149,10 @@ def align(
         thrown.update((problem.used[number].camera, ODD) for number in np.flatnonzero(odd))
         kept = [one for one, is_odd in zip(problem.used, odd, strict=True) if not is_odd]
         require_enough(kept, what)
+        if lost := [*sizes.keys() - _cameras_of(kept)]:
+            raise ManipError(
+                f"{what}: what {lost[0]} sees does not fit; lay the board nearer to it"
+            )
         problem.use(kept)
         pixel, encoder = problem.noise(values, pixel, encoder)
         _require_size(what, values[-1], deviations[-1])
@@ -271,41 +276,43 @@ class _Problem:
             for number in range(len(self.used))
         ]
 
-    def roots(self, values: F64, pixel: float, encoder: float) -> list[F64]:
+    def roots(self, values: F64, pixel: F64, encoder: float) -> list[F64]:
         """Return what divides each sighting's errors by a root of their covariance, (2c, 2c).
 
         Args:
             values: The parameters.
-            pixel: Standard deviation of corners [pixels].
+            pixel: Standard deviation of each camera's corners, (c,) [pixels].
             encoder: Standard deviation of the encoders' angles [rad].
         """
         found: list[F64] = []
-        for slopes in self._slopes(values):
-            covariance = pixel**2 * np.eye(len(slopes)) + encoder**2 * slopes @ slopes.T
+        for slopes, camera in zip(self._slopes(values), self._camera, strict=True):
+            noise = pixel[camera] ** 2 * np.eye(len(slopes))
+            covariance = noise + encoder**2 * slopes @ slopes.T
             found.append(np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), float))
         return found
 
-    def noise(self, values: F64, pixel: float, encoder: float) -> tuple[float, float]:
+    def noise(self, values: F64, pixel: F64, encoder: float) -> tuple[F64, float]:
         """Return better standard deviations, by expectation and maximisation.
 
         Args:
             values: The parameters.
-            pixel: As in `roots` [pixels].
+            pixel: As in `roots`, (c,) [pixels].
             encoder: As in `roots` [rad].
         """
-        pairs = [*zip(self.errors(values), self._slopes(values), strict=True)]
+        seen = [*zip(self.errors(values), self._slopes(values), self._camera, strict=True)]
         for _ in range(_UPDATES):
-            left: list[F64] = []
+            left: list[list[F64]] = [[] for _ in pixel]
             squares: list[F64] = []
-            for error, slopes in pairs:
-                variance = np.linalg.inv(slopes.T @ slopes / pixel**2 + self._eye / encoder**2)
-                moved = variance @ slopes.T @ error / pixel**2
-                left.append(error - slopes @ moved)
+            for error, slopes, camera in seen:
+                weight = slopes.T / pixel[camera] ** 2
+                variance = np.linalg.inv(weight @ slopes + self._eye / encoder**2)
+                moved = variance @ weight @ error
+                left[camera].append(error - slopes @ moved)
                 if slopes.any():  # the camera is on the hand
                     squares.append(moved**2 + np.diag(variance))
             encoder = float(np.sqrt(np.mean(squares)))
-            typical = 1.4826 * np.median(np.abs(np.concatenate(left)))
-            pixel = max(_LEAST_PIXEL, float(typical))
+            typical = [1.4826 * np.median(np.abs(np.concatenate(one))) for one in left]
+            pixel = np.maximum(typical, _LEAST_PIXEL)
         return pixel, encoder
 
     def fit(self, values: F64, roots: Sequence[F64], size: float) -> tuple[F64, F64]:
@@ -316,6 +323,7 @@ class _Problem:
             roots: As `roots` returns them.
             size: Standard deviation of the print's relative size.
         """
+        widths = np.log([width for width, _ in self._sizes.values()])
 
         def residuals(values: F64) -> F64:
             lenses, boards, zeros = self.parts(values)
@@ -323,6 +331,7 @@ class _Problem:
                 zeros[1:-1] / ZERO,
                 boards[:, 2] / _FLAT,
                 boards[:, 3:5].ravel() / _LEVEL,
+                (lenses[:, 6] - widths) / _FOCAL,
                 lenses[:, 7:].ravel() / _BENT,
                 values[-1:] / size,
             ]
@@ -382,7 +391,8 @@ class _Problem:
             np.zeros(5),
             flags=_GUESSED,
         )
-        lens = np.array([np.log(matrix[0, 0]), *np.clip(bent.ravel()[:2], -_BENT, _BENT)])
+        focal = width * np.exp(np.clip(np.log(matrix[0, 0] / width), -_FOCAL, _FOCAL))
+        lens = np.array([np.log(focal), *np.clip(bent.ravel()[:2], -_BENT, _BENT)])
         poses = [
             _matrix(place, Rotation.from_rotvec(turn.ravel()).as_matrix())
             for turn, place in zip(turns, places, strict=True)
