@@ -81,26 +81,42 @@ def motions_of(dataset: Dataset, scene: Scene) -> list[ArmMotion]:
         UsageError: If the arm has no servos.
         ManipError: If no episode is long enough.
     """
-    names = [*scene.actions.names]
-    for key in ("action", "observation.state"):
-        found = dataset.features[key].table.get("names") if key in dataset.features else None
-        if found != names:
-            raise MismatchError(f"{key}: names", str(dataset.root), found, scene.robot.name, names)
-    columns = dataset.columns(["action", "observation.state"])
-    for key, column in columns.items():
-        if not np.isfinite(column).all():
-            raise NotFiniteError(f"{dataset.root}: {key} has values that are not finite")
-    angles = [to_angles(scene.robot, columns[key]) for key in ("action", "observation.state")]
+    goal, measured = angles_of(dataset, scene.robot, ("action", "observation.state"))
     motions: list[ArmMotion] = []
     for start, stop in zip(dataset.episodes.start, dataset.episodes.stop, strict=True):
-        positions = np.asarray(np.unwrap(angles[1][start:stop], axis=0), float)
-        goals = angles[0][start:stop]
+        positions = np.asarray(np.unwrap(measured[start:stop], axis=0), float)
+        goals = goal[start:stop]
         goals = goals + 2 * np.pi * np.round((positions - goals) / (2 * np.pi))
         if len(goals) >= _LEAST_LENGTH * dataset.fps:
             motions.append(ArmMotion(goals, positions))
     if not motions:
         raise ManipError(f"{dataset.root} has no episode of {_LEAST_LENGTH:.0f} second or more")
     return motions
+
+
+def angles_of(dataset: Dataset, robot: Robot, keys: Sequence[str]) -> list[F64]:
+    """Return joint angles [rad] of columns of a LeRobot dataset of a servo arm, (T, n) each.
+
+    Args:
+        dataset: The dataset, in degrees, the gripper's from 0 to 100.
+        robot: The arm.
+        keys: Names of the columns.
+
+    Raises:
+        MismatchError: If the columns are not the arm's joints.
+        NotFiniteError: If a value is NaN or infinite.
+        UsageError: If the arm has no servos.
+    """
+    names = [*robot.joint_names]
+    for key in keys:
+        found = dataset.features[key].table.get("names") if key in dataset.features else None
+        if found != names:
+            raise MismatchError(f"{key}: names", str(dataset.root), found, robot.name, names)
+    columns = dataset.columns(keys)
+    for key, column in columns.items():
+        if not np.isfinite(column).all():
+            raise NotFiniteError(f"{dataset.root}: {key} has values that are not finite")
+    return [to_angles(robot, columns[key]) for key in keys]
 
 
 def _gripper_of(robot: Robot) -> tuple[float, float]:

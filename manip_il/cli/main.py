@@ -87,6 +87,8 @@ COMMANDS = {
         "check a policy against a recording of the real arm, before it moves",
     ),
     "robot excite": ("robots:ExciteOptions", "write a motion that tells a real arm's servos"),
+    "robot board": ("robots:BoardOptions", "write a board to print, for `robot align`"),
+    "robot align": ("robots:AlignOptions", "find a real arm's cameras and zeros from a dataset"),
     "env check": (
         "robots:EnvCheckOptions:env",
         "does a world of your own keep the contract, and how good is its expert",

@@ -2,9 +2,9 @@
 
 `manip-il serve`: a virtual SO-101 behind serial ports, for LeRobot's own programs.
 
-`manip-il robot new`, `check`, `certify`, `identify`, `excite`, `preflight`: a YAML file for your
-own arm, what the arm and its expert can do, the servos of a real one, a motion that tells them, and
-whether a policy fits the arm.
+`manip-il robot new`, `check`, `certify`, `identify`, `excite`, `board`, `align`, `preflight`: a
+YAML file for your own arm, what the arm and its expert can do, the servos of a real one, a motion
+that tells them, its cameras and zeros by a printed board, and whether a policy fits the arm.
 """
 
 from dataclasses import MISSING, dataclass, field
@@ -18,7 +18,7 @@ from manip_il.cli.common_options import (
     Trusting,
     Varied,
 )
-from manip_il.cli.outputs import Output, Replacing, output_folder
+from manip_il.cli.outputs import Output, OutputFile, Replacing, output_file, output_folder
 from manip_il.cli.parsing import Given, given
 from manip_il.option import NameOrPath, Seeded, option
 from manip_il.serve.config import SessionConfig
@@ -158,6 +158,36 @@ class ExciteOptions(Replacing, Seeded):
     dataset: Path = option(MISSING, "folder of the new dataset", positional=True)
     robot: NameOrPath = option("so101", "the arm", flag="robot.type")
     seconds: float = option(120.0, "length of the motion [s]", at_least=6, at_most=3600)
+
+
+@dataclass(frozen=True)
+class BoardOptions(OutputFile):
+    """Write a board with a pattern for `robot align`, as a PDF to print on A4 at 100 %.
+
+    Example: manip-il robot board --output=board.pdf
+    """
+
+    output: Path = output_file("board.pdf")
+
+
+@dataclass(frozen=True)
+class AlignOptions(Output):
+    """Find the cameras and the joints' zeros of an arm from a LeRobot dataset of it.
+
+    The board of `robot board` lies on the table, in another place in every episode, while the arm
+    rests in one posture after another with its wrist camera above the board. Writes arm.yaml, the
+    robot with these cameras and zeros, for `--robot.type=` of record, view and serve; and
+    report.html. Prints what to correct in LeRobot's calibration.
+
+    Example: manip-il robot align datasets/board --output_dir=runs/my_cameras
+    """
+
+    dataset: Path = option(MISSING, "a dataset of an arm with a wrist camera", positional=True)
+    robot: NameOrPath = option("so101", "the arm", flag="robot.type")
+    ruler: float = option(
+        100.0, "measured length of the line on the printed board [mm]", at_least=20, at_most=500
+    )
+    output_dir: Path = output_folder("runs/cameras")
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@ of its MJCF, and the files of that model, patched as the YAML says.
 """
 
 import importlib.util
+import math
 import multiprocessing
 import re
 import sys
@@ -208,6 +209,7 @@ GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
 JOINT_STEP = 0.1  # largest step of a joint target from the measured position [rad]
 # found in the model if the YAML does not give them
 FOUND = ("home", "gains", "forces", "armature", "ee")
+WRIST = "wrist"  # the camera on the hand
 # beside the hand and behind the fingertips, in the frame `ee` [m]
 WRIST_CAMERA = (0.10, 0.0, -0.08)
 
@@ -297,17 +299,21 @@ class TableTop:
 class CameraPose:
     """Pose of a camera in the world: z = 0 is the table's top, x points away from the robot.
 
-    If the camera looks straight down, x is up in its picture.
+    The wrist camera's is in the frame `ee`. If a camera looks straight down, x is up in its
+    picture.
 
     Attributes:
         position: Position of the camera, (3,) [m].
         target: Point that it looks at, (3,) [m].
         fovy: Vertical field of view [deg].
+        roll: Turn about its line of sight, counterclockwise seen from behind it [deg].
     """
 
     position: tuple[float, float, float]
     target: tuple[float, float, float]
     fovy: float = 42.0
+    # not in the robot's text, which older fingerprints hash; the compiled model has it
+    roll: float = field(default=0.0, repr=False)
 
     @property
     def quaternion(self) -> tuple[float, ...]:
@@ -324,6 +330,8 @@ class CameraPose:
         mujoco.mju_mat2Quat(
             quaternion, np.stack([right, np.cross(back, right), back], axis=1).flatten()
         )
+        half = math.radians(self.roll) / 2
+        mujoco.mju_mulQuat(quaternion, quaternion.copy(), [math.cos(half), 0, 0, math.sin(half)])
         return tuple(quaternion.tolist())
 
 
@@ -400,7 +408,7 @@ class Robot:
         workspace: Volume in which tasks take place.
         wrist_camera: Name of the model's camera on its hand, or position of an added one in the
             frame `ee` [m].
-        cameras: Poses of the scene's cameras, front and side, that replace the default ones.
+        cameras: Poses of the cameras front, side and wrist that replace the default ones.
         table: The scene's table.
         base: Position of the root body, (3,) [m]; None: as in the model.
         fixed: Positions of the joints that are neither the arm's nor the gripper's [rad or m].
@@ -411,6 +419,7 @@ class Robot:
             and [m].
         servos: How the servos move, by joint and parameter: value, and the ends of its range.
             Empty: they are ideal, and gravity does not act on the arm.
+        zeros: What to add to the real arm's joint angles, by joint, as it is calibrated [deg].
     """
 
     name: str
@@ -434,6 +443,8 @@ class Robot:
     lerobot: LeRobotConfig | None = None
     # not in the robot's text, which older fingerprints hash
     servos: Servos = field(default_factory=dict, hash=False, repr=False)
+    # of the real arm alone
+    zeros: Mapping[str, float] = field(default_factory=dict, hash=False, repr=False)
 
     def __post_init__(self) -> None:
         count = len(self.joints)
@@ -443,6 +454,9 @@ class Robot:
                 f"lerobot.names has {named} names; expected {count + 1}: the arm's, then the"
                 " gripper's"
             )
+        for joint in self.zeros:
+            if joint not in self.plain_names:
+                raise UnknownName("joint in zeros:", joint, self.plain_names)
         if self.servos:
             servo_ranges(self.servos, self.joint_names)
             if self.gripper.files or len(self.gripper.joints) != 1:
@@ -452,6 +466,16 @@ class Robot:
     def joint_names(self) -> tuple[str, ...]:
         """Names of the entries of an action or a state: arm joints, then the gripper."""
         return self.lerobot.names if self.lerobot is not None else (*self.joints, "gripper")
+
+    @property
+    def plain_names(self) -> tuple[str, ...]:
+        """`joint_names` without the ending of LeRobot's names."""
+        return tuple(name.removesuffix(".pos") for name in self.joint_names)
+
+    @property
+    def wrist_place(self) -> CameraPose | tuple[float, float, float] | str:
+        """The pose in `cameras` of the camera on the hand, else `wrist_camera`."""
+        return self.cameras.get(WRIST, self.wrist_camera)
 
     @property
     def fps(self) -> int:

@@ -12,7 +12,14 @@ import numpy as np
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.mdp import F64
-from manip_il.robots.robot import GRIPPER, GripperConfig, ModelFiles, Robot
+from manip_il.robots.robot import (
+    GRIPPER,
+    WRIST,
+    CameraPose,
+    GripperConfig,
+    ModelFiles,
+    Robot,
+)
 
 # defaults for what we add to a model, because its own defaults may set a material or a range
 PLAIN = mujoco.MjSpec()
@@ -23,7 +30,6 @@ _DAMPING = 1.0  # damping of an arm joint [N m s/rad]
 _SLIDES = (800.0, 20.0, 40.0), 0.2, 10.0
 _TURNS = (20.0, 0.5, 10.0), 0.005, 0.1
 _LINK_ARMATURE, _LINK_DAMPING = 0.001, 0.02  # for a linkage's joint [kg m^2], [N m s/rad]
-WRIST = "wrist"  # the camera on the hand
 # added wrist camera: tilt towards the fingertips [rad], vertical field of view [deg]
 _TILT, _FOVY = 0.45, 70.0
 # compiler options
@@ -140,7 +146,8 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
     Raises:
         UsageError: If a joint, body or file is missing; the message names it, and those that exist.
     """
-    camera = robot.wrist_camera if isinstance(robot.wrist_camera, str) else ""
+    place = robot.wrist_place
+    camera = place if isinstance(place, str) else ""
     spec = bare_spec(robot.name, robot.files, robot.hand, robot.gripper, camera)
     require(robot.name, "joint", (*robot.joints, *robot.gripper.joints), spec.joints)
     require(robot.name, "body", (robot.hand, robot.ee.body, *robot.gripper.fingers), spec.bodies)
@@ -165,28 +172,34 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
     return spec
 
 
-def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, place: Sequence[float]) -> None:
-    """Add the camera `wrist` to an arm, tilted towards the fingertips.
-
-    The camera looks along its -z, and its x is parallel to the hand's y.
+def add_wrist_camera(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, place: CameraPose | Sequence[float]
+) -> None:
+    """Add the camera `wrist` to an arm.
 
     Args:
         spec: The arm, with the site `ee`; the camera is added to the body of this site.
         model: The same arm, compiled.
-        place: Position of the camera in the frame `ee`, (3,) [m].
+        place: Pose of the camera in the frame `ee`; or its position, (3,) [m], if it is tilted
+            towards the fingertips: it then looks along its -z, and its x is parallel to the hand's
+            y.
     """
     rotation, quat = np.zeros((3, 3)), np.zeros(4)
-    side = np.sign(place[0]) or 1.0
     site = model.site("ee")
     mujoco.mju_quat2Mat(rotation.ravel(), site.quat)
-    back = np.array([side * np.sin(_TILT), 0, -np.cos(_TILT)])
-    right = np.array([0.0, side, 0.0])
-    axes = np.stack([right, np.cross(back, right), back], axis=1)
-    mujoco.mju_mat2Quat(quat, (rotation @ axes).ravel())
+    if isinstance(place, CameraPose):
+        fovy, position = place.fovy, place.position
+        mujoco.mju_mulQuat(quat, site.quat, place.quaternion)
+    else:
+        fovy, position = _FOVY, place
+        side = np.sign(place[0]) or 1.0
+        back = np.array([side * np.sin(_TILT), 0, -np.cos(_TILT)])
+        right = np.array([0.0, side, 0.0])
+        axes = np.stack([right, np.cross(back, right), back], axis=1)
+        mujoco.mju_mat2Quat(quat, (rotation @ axes).ravel())
     hand: Any = spec.site("ee")
-    hand.parent.add_camera(
-        PLAIN.default, name=WRIST, pos=site.pos + rotation @ np.array(place), quat=quat, fovy=_FOVY
-    )
+    at = site.pos + rotation @ np.array(position)
+    hand.parent.add_camera(PLAIN.default, name=WRIST, pos=at, quat=quat, fovy=fovy)
 
 
 def arm_model(robot: Robot) -> mujoco.MjModel:

@@ -16,6 +16,7 @@ from manip_il.robots.robot import (
     FOUND,
     GRIPPER,
     KEYS,
+    WRIST,
     GripperConfig,
     ModelFiles,
     Robot,
@@ -25,7 +26,7 @@ from manip_il.robots.robot import (
 from manip_il.robots.servos import servos_of
 from manip_il.robots.spec import arm_joints
 
-SCENE_CAMERAS = ("front", "side")  # cameras that a YAML may place
+PLACED = ("front", "side", WRIST)  # cameras that a YAML may place
 EXTENDS = "extends"  # key of the robot whose values a YAML changes
 
 
@@ -109,8 +110,8 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
         said["files"] = ModelFiles.read("", tree, path.parent)
         said["gripper"] = _gripper(checks.mapping("gripper", tree["gripper"]), path.parent)
     for camera in checks.mapping("cameras", tree.get("cameras", {})):
-        if camera not in SCENE_CAMERAS:
-            raise UnknownName("camera in a robot's YAML:", camera, SCENE_CAMERAS)
+        if camera not in PLACED:
+            raise UnknownName("camera in a robot's YAML:", camera, PLACED)
     said |= {
         key: read(key, kinds[key], value)
         for key, value in tree.items()

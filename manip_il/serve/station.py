@@ -175,10 +175,11 @@ class Station:
         self.env.start(seed)
         self.seed, self._solved = seed, 0
         world, servos = self.env.world, self.follower.servos
-        offset = np.zeros(len(servos.q))
+        robot = self.env.scene.robot
+        offset = -np.radians([robot.zeros.get(name, 0.0) for name in robot.plain_names])
         if self._config.varies:
             servos.begin(world.model, world.data, servos.draw(rng_for(seed, "servos"), 1.0))
-            offset = rng_for(seed, "encoders").uniform(-OFFSET, OFFSET, len(offset))
+            offset = offset + rng_for(seed, "encoders").uniform(-OFFSET, OFFSET, len(offset))
         self.follower.reset(offset)
         self._place_leader(self.follower.q)
         self._views = Link(self._config, self._look(), rng_for(seed, "views"))

@@ -148,8 +148,8 @@ def scene_spec(robot: Robot, task: Any) -> mujoco.MjSpec:
     arm = arm_spec(robot)
     arm_alone = arm.copy().compile()
     _add_pedestal(spec, arm_alone, robot)
-    if not isinstance(robot.wrist_camera, str):
-        add_wrist_camera(arm, arm_alone, robot.wrist_camera)
+    if not isinstance(place := robot.wrist_place, str):
+        add_wrist_camera(arm, arm_alone, place)
     copy_options(spec, arm)
     spec.attach(arm, prefix=PREFIX, frame=spec.worldbody.add_frame())
     _add_cameras(spec, robot)

@@ -71,6 +71,16 @@ def told(station: Station, joint: int, degrees: float) -> None:
     bus["Goal_Position"] = bus["Present_Position"] + np.eye(6)[joint] * degrees / 360 * 4096
 
 
+def test_a_badly_calibrated_arm_shows_angles_that_its_zeros_correct(tmp_path: Path):
+    yaml = tmp_path / "bent.yaml"
+    yaml.write_text("extends: so101\nzeros: {elbow_flex: 10}\n")
+    station = station_of(tmp_path / "out", robot=str(yaml))
+    shown = station.buses["follower"]["Present_Position"] / 4096 * 360 - 180
+    off = shown - np.degrees(station.follower.q)
+    station.close()
+    np.testing.assert_allclose(off, [0, 0, -10, 0, 0, 0], atol=0.1)
+
+
 @pytest.mark.parametrize(("servo", "most"), [("ideal", 0.6), ("sts3215", 6.0)])
 def test_joints_go_where_they_are_told(tmp_path: Path, servo: str, most: float):
     """Ideal servos to within a fraction of a degree; real ones sag and have play."""

@@ -1,4 +1,6 @@
-"""Run `manip-il robot new`, `check`, `certify`, `identify`, `excite`, `preflight`."""
+"""Run `manip-il robot new`, `check`, `certify`, `identify`, `excite`, `board`, `align`,
+`preflight`.
+"""
 
 import os
 from dataclasses import replace
@@ -8,13 +10,20 @@ import numpy as np
 
 from manip_il import checks
 from manip_il.bridges.doctor.examine import examine_folder
+from manip_il.calibrate import align_page
+from manip_il.calibrate.align import ROUNDS as ALIGN_ROUNDS
+from manip_il.calibrate.align import align
+from manip_il.calibrate.board import sheet
 from manip_il.calibrate.excite import excite
 from manip_il.calibrate.page import advice as untold
 from manip_il.calibrate.page import identified_report, servo_table, to_yaml
 from manip_il.calibrate.preflight import Preflight
 from manip_il.calibrate.servos import ROUNDS, ServoArm, identify, in_units, motions_of
+from manip_il.calibrate.sightings import sightings_of
 from manip_il.cli.outputs import OutputFile, about, progress, publish, say
 from manip_il.cli.robots import (
+    AlignOptions,
+    BoardOptions,
     CertifyOptions,
     ExciteOptions,
     IdentifyOptions,
@@ -38,6 +47,7 @@ from manip_il.evaluation.robot_check import (
     verdict,
 )
 from manip_il.learn.policy import LearnedPolicy
+from manip_il.option import NameOrPath
 from manip_il.progress import Progress
 from manip_il.robots.found import suggest, yaml_of
 from manip_il.robots.gripper import sweep
@@ -126,12 +136,46 @@ def run_identify(options: IdentifyOptions) -> None:
         with progress(ROUNDS, f"identify {options.dataset}") as bar:
             joints = scene.actions.names
             found = identify(arm, motions, joints, lambda: bar.step())
-        path, base = folder / "arm.yaml", options.robot
-        named = os.path.relpath(base, folder) if isinstance(base, Path) else base
-        write_file(path, to_yaml(found, named).encode())
+        path = folder / "arm.yaml"
+        write_file(path, to_yaml(found, _extended(options.robot, folder)).encode())
         page = replace(identified_report(found, dataset.fps), **about(options))
         servo_table(found).print()
         say(*untold(found), f"robot: {path}", f"report: {page.write(folder)}")
+
+
+def _extended(robot: NameOrPath, folder: Path) -> str:
+    """Return a robot as `extends` names it in a YAML in a folder."""
+    return os.path.relpath(robot, folder) if isinstance(robot, Path) else robot
+
+
+def run_board(options: BoardOptions) -> None:
+    """Write the sheet."""
+    options.check()
+    write_file(options.output, sheet())
+    say(f"board: {options.output}; print it on A4 at 100 %, and measure the line below the board")
+
+
+def run_align(options: AlignOptions) -> None:
+    """Find the board, fit, write the robot and the page, print the tables."""
+    dataset = Dataset.open(options.dataset)
+    robot = get_robot(options.robot)
+    with options.open() as folder:
+        with progress(None, f"board in {options.dataset}") as bar:
+            seen = sightings_of(dataset, robot, options.ruler, lambda: bar.step())
+        with progress(ALIGN_ROUNDS, f"align {options.dataset}") as bar:
+            found = align(robot, seen, str(options.dataset), lambda: bar.step())
+        path = folder / "arm.yaml"
+        extends = _extended(options.robot, folder)
+        write_file(path, align_page.to_yaml(found, robot, extends).encode())
+        page = replace(align_page.aligned_report(found, robot, dataset), **about(options))
+        for table in (
+            align_page.thrown_table(found),
+            align_page.camera_table(found),
+            align_page.zero_table(found, robot),
+        ):
+            table.print()
+        say(*align_page.untold(found, robot), page.verdict)
+        say(f"robot: {path}", f"report: {page.write(folder)}")
 
 
 def run_preflight(options: PreflightOptions) -> None:
