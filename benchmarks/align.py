@@ -31,7 +31,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from manip_il.calibrate.align import Aligned, Hand, align
+from manip_il.calibrate.align import Aligned, HandPoses, align
 from manip_il.calibrate.align_page import camera_lines
 from manip_il.calibrate.board import SQUARE, SQUARES, drawn
 from manip_il.calibrate.sightings import Sightings, look
@@ -196,7 +196,7 @@ def record(truth: Truth, rests: int, play: float, rng: np.random.Generator) -> S
                 continue
             error = math.radians(play) / 2 * rng.uniform(-1, 1, len(home))
             encoder = ENCODER * np.round((q - truth.zeros + error) / ENCODER)
-            drawn_now = render.pictures(scene, data, CameraConfig((FIXED, WRIST), *SIZE[::-1]))
+            drawn_now = render.pictures(scene, data, CameraConfig((FIXED, WRIST), SIZE[1], SIZE[0]))
             for name in (WRIST, FIXED):
                 seen, _ = look(
                     photograph(drawn_now[name], truth.lenses[name], rng),
@@ -226,7 +226,7 @@ def pose(lens: F64) -> F64:
     return found
 
 
-def hand_pose(hand: Hand, joints: F64) -> F64:
+def hand_pose(hand: HandPoses, joints: F64) -> F64:
     """Return the pose of `ee`, (4, 4)."""
     found = np.eye(4)
     found[:3, 3], found[:3, :3] = hand.pose(joints)
@@ -236,7 +236,7 @@ def hand_pose(hand: Hand, joints: F64) -> F64:
 def errors(truth: Truth, found: Aligned, rng: np.random.Generator) -> tuple[float, float]:
     """Return median errors of fingertips and of a point of the table [m]."""
     robot = get_robot("so101")
-    hand, home = Hand(robot), np.array(robot.home)
+    hand, home = HandPoses(robot), np.array(robot.home)
     lenses = dict(zip(found.names, found.lenses, strict=True))
     tips: list[float] = []
     points: list[float] = []
@@ -261,7 +261,7 @@ def errors(truth: Truth, found: Aligned, rng: np.random.Generator) -> tuple[floa
 
 def scores(truth: Truth, found: Aligned) -> F64:
     """Return the errors of all that is told, in standard deviations."""
-    hand = Hand(get_robot("so101"))
+    hand = HandPoses(get_robot("so101"))
     held = truth.zeros * [0, 1, 1, 1, 0]
     # the same arm with the pan's and the roll's zero in its cameras' poses
     around = hand_pose(hand, truth.zeros * [1, 1, 1, 1, 0]) @ np.linalg.inv(hand_pose(hand, held))

@@ -84,7 +84,7 @@ class Aligned:
         return tuple(self.sizes)
 
 
-class Hand:
+class HandPoses:
     """Poses of the frame `ee`, which carries the wrist camera.
 
     Args:
@@ -213,8 +213,11 @@ class _Problem:
     """
 
     def __init__(self, robot: Robot, sizes: dict[str, tuple[int, int]], used: list[Sighting]):
-        self._hand, self._sizes, self._eye = Hand(robot), sizes, np.eye(len(robot.joints))
-        self._names, self._places = [*sizes], sorted({one.place for one in used})
+        self._hand = HandPoses(robot)
+        self._sizes = sizes
+        self._names = [*sizes]
+        self._eye = np.eye(len(robot.joints))
+        self._places = sorted({one.place for one in used})
         self.use(used)
 
     def use(self, used: list[Sighting]) -> None:

@@ -38,7 +38,9 @@ def sheet() -> bytes:
     figure = Figure((_SHEET[0] / _INCH, _SHEET[1] / _INCH))
     axes = figure.add_axes((0, 0, 1, 1))
     width, height = (count * SQUARE for count in SQUARES)
-    left, low, line = (_SHEET[0] - width) / 2, 0.045, 0.025
+    left = (_SHEET[0] - width) / 2
+    low = 0.045  # lower edge of the board [m]
+    line = 0.025  # height of the ruler [m]
     edges = (left, left + width, low, low + height)
     axes.imshow(drawn(), "gray", extent=edges, interpolation="nearest")
     axes.set(xlim=(0, _SHEET[0]), ylim=(0, _SHEET[1]))

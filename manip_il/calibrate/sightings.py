@@ -24,13 +24,12 @@ _STILL, _REST = np.radians(0.3), 0.3  # joints at rest move less [rad] in this t
 _MOST = 60  # pictures of a place of the board
 _CORNERS = 8  # least number in a picture
 _SHARP = 0.3  # least sharpness, as a share of the camera's median
-MOVING, UNSEEN, HALF, BLURRED, ODD = (
-    "the arm moves",
-    "no board",
-    f"fewer than {_CORNERS} corners of the board",
-    "blurred",
-    "does not fit the others",
-)
+# why a picture is not used
+MOVING = "the arm moves"
+UNSEEN = "no board"
+HALF = f"fewer than {_CORNERS} corners of the board"
+BLURRED = "blurred"
+ODD = "does not fit the others"
 
 
 @dataclass(frozen=True)

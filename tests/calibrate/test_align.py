@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from manip_il.calibrate import board
-from manip_il.calibrate.align import Hand, project
+from manip_il.calibrate.align import HandPoses, project
 from manip_il.cli.main import main
 from manip_il.data.dataset import EpisodeData
 from manip_il.data.lerobot_write import write_episodes
@@ -61,7 +61,7 @@ def photograph(lens: F64, place: F64, hand: tuple[F64, F64]) -> np.ndarray:
 
 def write(root: Path, *, shown: bool = True, scale: float = 1.0, rests: int = RESTS) -> Path:
     """Write a dataset; `scale`: of the print."""
-    hand, rng = Hand(ROBOT), np.random.default_rng(0)
+    hand, rng = HandPoses(ROBOT), np.random.default_rng(0)
     still = np.zeros(3), np.eye(3)
     episodes: list[EpisodeData] = []
     for _ in range(PLACES):

@@ -30,9 +30,8 @@ def margin(shown: Demonstration, path: np.ndarray) -> float:
 
 
 def objective(shown: list[Demonstration], weights: np.ndarray) -> float:
-    return (
-        float(np.mean([loss_of(one, weights)[0] for one in shown])) + RIDGE / 2 * weights @ weights
-    )
+    mean = np.mean([loss_of(one, weights)[0] for one in shown])
+    return float(mean + RIDGE / 2 * weights @ weights)
 
 
 @pytest.mark.parametrize("seed", range(20))
