@@ -5,6 +5,7 @@ needed, and small.
 import shutil
 from pathlib import Path
 
+from ..boards import write as write_board
 from ..robots.own import model_of, write
 from .ours import Ours
 from .pages import ROOT, command_of
@@ -44,6 +45,7 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
 READ_BY = {"pairs.json": "runs/dagger"}
 ARM = Path("my_arm.yaml")
 SAMPLE = "datasets/sample"  # comes with the repository
+BOARD = "datasets/board"  # of `robot align`
 _OUTPUTS = ("output", "output_dir", "output-dir", "video", "new_root", "log")
 # make their second
 _TARGETS = ("data build", "data render", "data to-mcap", "data from-mcap", "pull")
@@ -64,7 +66,8 @@ class Stock:
             if path.endswith(".xml") and not (target / path).exists():
                 (target / path).write_text(model_of())
             name = next(
-                (name for name in (*RECIPES, SAMPLE) if f"{path}/".startswith(f"{name}/")), None
+                (name for name in (*RECIPES, SAMPLE, BOARD) if f"{path}/".startswith(f"{name}/")),
+                None,
             )
             if name is None or (target / name).exists():
                 continue
@@ -75,6 +78,8 @@ class Stock:
     def _made(self, name: str, ours: Ours) -> Path:
         if name == SAMPLE:
             return ROOT / SAMPLE
+        if name == BOARD and not (self.folder / name).exists():
+            write_board(self.folder / name)
         if not (self.folder / name).exists():
             words = tuple(RECIPES[name].split())
             self.bring(("manip-il", *words), self.folder, ours)
