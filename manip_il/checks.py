@@ -259,6 +259,22 @@ def read_yaml(path: Path, what: str) -> Any:
         raise UsageError(f"{path} is not YAML: {error}") from error
 
 
+def finite(what: str, tree: Any) -> None:
+    """Raise `ManipError` if a number in nested lists and mappings is NaN or infinite.
+
+    Args:
+        what: The name of the value, for the message.
+        tree: The value.
+    """
+    if isinstance(tree, float):
+        number(what, tree)
+    parts = tree.items() if isinstance(tree, dict) else ()
+    if isinstance(tree, list):
+        parts = enumerate(tree)
+    for key, part in parts:
+        finite(f"{what}.{key}", part)
+
+
 def open_outside(path: Path, what: str, refusal: type[ManipError] = ManipError) -> BufferedReader:
     """Open a file from outside for reading.
 

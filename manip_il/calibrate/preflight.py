@@ -33,6 +33,7 @@ Mask = NDArray[np.bool_]
 _SIDE = (32, 32)  # of the reduced pictures that are compared [pixels]
 _BETTER = 0.3  # how much better a fault must explain the pictures, as a difference of correlations,
 _NEARER = 1.1  # or the gripper, as the logarithm of a ratio of errors
+_PLAIN = 3.0  # standard deviation of the pixels below which a picture shows nothing, of 255
 _CHANGED = 20.0  # least change of a pixel that shows the gripper's opening, of 255
 _PIXELS = 10  # fewer such pixels tell nothing
 _COLOURED = 0.4  # share of the strongest colour from which a pixel counts as coloured
@@ -170,6 +171,9 @@ class Preflight:
                 text = f"{likely or 'no other camera'} is recorded, and the policy reads {name}"
                 remedy = f"name it {name} in --robot.cameras" if likely else "add the camera"
                 yield Finding(IMAGES + name, text, remedy)
+                continue
+            if _shrink(self.seen[name]).std() < _PLAIN:
+                yield Finding(IMAGES + name, "nothing is seen", "uncover and light the camera")
                 continue
             high, wide = self.seen[name].shape[:2]
             # the cnn reduces larger pictures itself

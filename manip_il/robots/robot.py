@@ -454,9 +454,10 @@ class Robot:
                 f"lerobot.names has {named} names; expected {count + 1}: the arm's, then the"
                 " gripper's"
             )
-        for joint in self.zeros:
+        for joint, zero in self.zeros.items():
             if joint not in self.plain_names:
                 raise UnknownName("joint in zeros:", joint, self.plain_names)
+            checks.number(f"zeros.{joint}", zero, -180, 180)
         if self.servos:
             servo_ranges(self.servos, self.joint_names)
             if self.gripper.files or len(self.gripper.joints) != 1:

@@ -93,9 +93,10 @@ def _said(path: Path, tree: Any) -> dict[str, Any]:
     tree, kinds = dict(checks.mapping(str(path), tree)), typing.get_type_hints(Robot)
     own = [name for name in kinds if name not in ("name", "files", "gripper")]
     known = (EXTENDS, *own) if EXTENDS in tree else (*KEYS, "gripper", *own)
-    for key in tree:
+    for key, value in tree.items():
         if key not in known:
             raise UnknownName(f"key in {path}:", key, known)
+        checks.finite(key, value)
     if "hand" not in tree and "ee" in tree:
         tree["hand"] = checks.mapping("ee", tree["ee"]).get("body")
     said: dict[str, Any] = {"name": checks.name("a robot's name", path.stem)}

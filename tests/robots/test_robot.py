@@ -1,5 +1,6 @@
 """A robot is one YAML beside its model; what is wrong in either is one line."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,10 @@ MISTAKES = {
     "unknown joint": (
         but(joints=["turn", "shoulder", "elbwo", "wrist", "roll"]),
         ["unknown joint", "own", "'elbwo'", "did you mean 'elbow'", "known: elbow, left"],
+    ),
+    "not a number": (
+        but(cameras={"front": {"position": [math.nan, 0, 1], "target": [0, 0, 0]}}),
+        ["cameras.front.position.0 is nan", "finite"],
     ),
     "opened the wrong way round": (
         inside("gripper", closed=[0.045] * 2, open=[0.0] * 2),
